@@ -29,6 +29,7 @@ BENCHMARKS = {
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),
+    "capacity": ("capacity_sizes", "measure"),
     "optimum": ("fleet_optimum", "measure"),
     "study": ("study", "measure"),
     "parts": ("parts", "measure"),

@@ -184,7 +184,6 @@ class _Cell:
         told, self.gathered = self.gathered, []
         if self.cycle % BEATS == self.number % BEATS:
             told += [self._beat(who, node, now_ns) for who, node in self.everybody]
-            self._put("agent@E", *self._beat("agent@E", "E", now_ns))
         self._put("agent@E", self.keys.gathered(), encode(Carried(tuple(told))))
 
     def _beat(self, who: str, node: str, now_ns: int) -> tuple[str, bytes]:

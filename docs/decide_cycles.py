@@ -17,10 +17,10 @@ from pathlib import Path
 import polars as pl
 
 from benchmarks.sooner import INTERVALS, SCENARIOS, compared
+from dwell.display import Measure
 from dwell.report.charts import curves
 from dwell.report.figure import Figure, Spec, printed_svg
 from dwell.report.figure_files import BOTH_PT
-from dwell.report.formatting import Measure
 from dwell.report.palette import Palette
 from dwell.study import mean_interval
 

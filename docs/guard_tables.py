@@ -1,4 +1,4 @@
-"""The tables of guard.md: `python docs/guard_tables.py`, some minutes.
+"""The tables of reproduction/evidence/guard.md: `python docs/guard_tables.py`, some minutes.
 
 The canonical cell under three policies, four seeds of 300 windows each, with and without its guard.
 """

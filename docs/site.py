@@ -8,6 +8,7 @@ site would load anything from another host.
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -33,7 +34,12 @@ SECTIONS = {
     "Background": "background",
     "Decisions": "decisions",
 }
-CONTRACTS = ("concepts", "guard", "live-protocol", "architecture")
+CONTRACTS = (
+    "docs/concepts.md",
+    "docs/guard.md",
+    "docs/live-protocol.md",
+    "docs/architecture.md",
+)
 
 
 def linked(page: str, text: str) -> set[str]:
@@ -85,29 +91,29 @@ def title(text: str) -> str:
 
 
 def navigation(found: dict[str, str]) -> list[object]:
-    """Return the navigation of the site: each page below the title of its folder."""
+    """Return the navigation of the site: pages by folder, in the order of the index."""
+    index = found["docs/index.md"]
+    order = [os.path.normpath(f"docs/{target}") for target in LINK.findall(index)]
+    listed = sorted(found, key=lambda page: order.index(page) if page in order else len(order))
 
-    def entry(page: str) -> dict[str, str]:
-        return {title(found[page]): page}
+    def entries(folder: Path) -> list[dict[str, str]]:
+        return [{title(found[page]): page} for page in listed if Path(page).parent == folder]
 
-    folders: list[object] = [
-        {
-            name: [
-                entry(page) for page in sorted(found) if Path(page).parent == Path("docs") / folder
-            ]
-        }
-        for name, folder in SECTIONS.items()
-    ]
-    laboratory = [entry(page) for page in sorted(found) if page.startswith("lab/")]
-    evidence = [entry(page) for page in sorted(found) if page.startswith("reproduction/")]
+    docs = Path("docs")
     return [
         {"Dwell": "README.md"},
         {"Documentation": "docs/index.md"},
-        {"Contracts": [entry(f"docs/{name}.md") for name in CONTRACTS]},
-        *folders,
-        {"Laboratory": laboratory},
-        {"Evidence": evidence},
+        {"Contracts": [{title(found[page]): page} for page in CONTRACTS]},
+        *({name: entries(docs / folder)} for name, folder in SECTIONS.items()),
+        {"Laboratory": entries(Path("lab/docs"))},
+        {"Evidence": entries(Path("reproduction/evidence"))},
     ]
+
+
+def _palette(preference: str, scheme: str, icon: str) -> dict[str, object]:
+    toggle = {"icon": f"lucide/{icon}", "name": "Switch between light and dark"}
+    media = f"(prefers-color-scheme: {preference})"
+    return {"media": media, "scheme": scheme, "toggle": toggle}
 
 
 def settings(found: dict[str, str]) -> dict[str, object]:
@@ -128,7 +134,11 @@ def settings(found: dict[str, str]) -> dict[str, object]:
         "docs_dir": SOURCE.name,
         "site_dir": SITE.name,
         "use_directory_urls": False,
-        "theme": {"font": False, "features": ["navigation.sections", "search.highlight"]},
+        "theme": {
+            "font": False,
+            "features": ["navigation.sections", "search.highlight"],
+            "palette": [_palette("light", "default", "moon"), _palette("dark", "slate", "sun")],
+        },
         "nav": navigation(found),
         "markdown_extensions": {
             "tables": {},

@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 24_952, "live": 15_156, "lab": 6_834}
+MOST = {"simulator": 25_380, "live": 15_555, "lab": 6_820}
 
 
 def code_lines(text: str) -> int:

@@ -2,9 +2,9 @@
 
 Builds a wheel per processor, and looks at each with auditwheel. Installs the wheel with the pinned
 packages in each Python of this computer and simulates a packaged example; for other versions it
-looks up whether each pinned package has a wheel. Then it does what README says as a stranger: a
-clone in an empty folder and an empty home folder, with no variables except those by which this
-computer reaches a package index.
+looks up whether each pinned package has a wheel. Makes the gallery again, and compares its data.
+Then it does what README says as a stranger: a clone in an empty folder and an empty home folder,
+with no variables except those by which this computer reaches a package index.
 """
 
 from __future__ import annotations
@@ -102,6 +102,12 @@ def lines_of(readme: str) -> list[str]:
     return [command for command in commands if not command.startswith(LEFT_OUT)]
 
 
+def check_gallery() -> str:
+    """Make the pictures of the pages again; their data have to be the kept data."""
+    run(sys.executable, "-m", "docs.gallery", "--check")
+    return "the gallery has the data that the examples give"
+
+
 def check_stranger(folder: Path) -> str:
     """Do what README says in a clone, with an empty home folder and no variables."""
     clone, home = folder / "clone", folder / "home"
@@ -126,6 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         checks: dict[str, tuple[Callable[..., str], tuple[object, ...]]] = {
             **{f"wheel {one}": (check_wheel, (one, folder)) for one in PLATFORMS},
             **{f"python {one}": (check_python, (one, folder)) for one in VERSIONS},
+            "gallery": (check_gallery, ()),
             "stranger": (check_stranger, (folder,)),
         }
         for check, (does, given) in checks.items():

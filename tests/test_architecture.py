@@ -194,7 +194,10 @@ MAY_IMPORT = {
     "live.wire": ("cellfile",),
     "live.transport": ("live", "live.wire"),
     "live.trust": ("live.wire", "files"),
-    "live.roles": ("live", "live.transport", "live.wire", "live.trust", "control", "record"),
+    "live.roles": (
+        *("live", "live.transport", "live.wire", "live.trust", "control", "record"),
+        "study.metric",
+    ),
     "live.ros2": ("live", "live.wire"),
     "live.host": (*LIVE, "live.ros2", "control", "record", "cellfile", "files"),
     "live.local": (*LIVE, "live.host", "sim", "record", "cellfile", "files"),
@@ -240,6 +243,48 @@ def may_import(importer: str, imported: str) -> bool:
         return True
     rows = MAY_IMPORT[importer]
     return target in rows or imported.removeprefix("dwell.") in rows
+
+
+#: Functions with more lines than `MOST_LINES`; the list may only shrink.
+LONG = {
+    "dwell/estimators/prices.py:price_of",
+    "dwell/kernels/arrays.py:_Layout._tables",
+    "dwell/live/host/node.py:run_agent",
+    "dwell/live/host/node.py:run_controller",
+    "dwell/live/roles/worker.py:Worker.__init__",
+}
+#: Most lines of a function without its docstring; of a command also without its options.
+MOST_LINES = 60
+
+
+def functions(tree: ast.AST, prefix: str = "") -> Iterator[tuple[str, ast.FunctionDef]]:
+    """Yield the functions of a source with their names, those of classes as Class.name."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef):
+            yield f"{prefix}{node.name}", node
+        inner = f"{node.name}." if isinstance(node, ast.ClassDef) else prefix
+        yield from functions(node, inner)
+
+
+def lines_of(function: ast.FunctionDef, *, is_command: bool) -> int:
+    """Return the number of lines of a function without its docstring."""
+    statements = function.body
+    documented = ast.get_docstring(function, clean=False) is not None
+    first, last = statements[0], statements[-1]
+    body = (last.end_lineno or 0) - first.lineno + 1
+    docstring = (first.end_lineno or 0) - first.lineno + 1 if documented else 0
+    return body - docstring + (0 if is_command else first.lineno - function.lineno)
+
+
+def test_a_function_fits_a_screen() -> None:
+    found = set()
+    for folder in (SOURCES.parent, ROOT / "lab" / "src"):
+        for path in folder.rglob("*.py"):
+            is_command = path.parent.name in ("cli", "commands")
+            for name, function in functions(ast.parse(path.read_text(encoding="utf-8"))):
+                if lines_of(function, is_command=is_command) > MOST_LINES:
+                    found.add(f"{path.relative_to(folder)}:{name}")
+    assert found == LONG
 
 
 def test_no_file_stands_on_itself() -> None:

@@ -160,7 +160,7 @@ def objects(
         *(Guard(["LOC"], placement="SO", **guard), CellGuard(canonical)),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3)), LookedAt(0, 0, 1)),
-        Evidence(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants),
+        *(instants, Evidence.of(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants)),
         Trace(table, "rtt_ms"),
         Hindsight(),
         dwell.simulate_fleet(

@@ -16,7 +16,8 @@ import typer.main
 from typer.testing import CliRunner
 
 from docs import commands as commands_page
-from docs import site
+from docs import gallery, site
+from docs import metrics as metrics_page
 from dwell.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
@@ -28,6 +29,7 @@ EXECUTED = (
     "docs/start/first-result.md",
     "docs/reference/estimators.md",
     "docs/start/live-tutorial.md",
+    "docs/howto/accelerators.md",
     "docs/howto/profiling.md",
     "docs/howto/studies.md",
     "docs/start/tutorial.md",
@@ -122,6 +124,10 @@ def test_the_page_of_commands_is_the_generated_one() -> None:
     assert commands_page.PAGE.read_text(encoding="utf-8") == commands_page.page()
 
 
+def test_the_page_of_metrics_is_the_generated_one() -> None:
+    assert metrics_page.PAGE.read_text(encoding="utf-8") == metrics_page.page()
+
+
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
 def test_links_lead_somewhere(page: Path) -> None:
     prose = FENCE.sub("", page.read_text(encoding="utf-8"))
@@ -174,3 +180,10 @@ def test_public_names_have_a_docstring(name: str) -> None:
     public = importlib.import_module(module)
     assert attribute in public.__all__
     assert inspect.getdoc(pkgutil.resolve_name(f"{module}:{attribute}"))
+
+
+@pytest.mark.parametrize("picture", gallery.PICTURES, ids=lambda picture: picture.name)
+def test_pictures_of_the_gallery_have_their_data(picture: gallery.Picture) -> None:
+    page = (ROOT / "docs" / "start" / "gallery.md").read_text(encoding="utf-8")
+    assert f"images/{picture.name}.svg" in page
+    assert (gallery.IMAGES / f"{picture.name}.csv").is_file()

@@ -36,7 +36,7 @@ PROC = {
 
 def test_stolen_time_is_that_of_the_cores_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
     text = dict(PROC)
-    monkeypatch.setattr(machine_conditions, "_text", lambda path: text.get(path, ""))
+    monkeypatch.setattr(machine_conditions, "text_of", lambda path: text.get(path, ""))
     counters = MachineCounters([1])
     later = text["/proc/stat"].replace("cpu1 5 0 5 85 0 0 0 5", "cpu1 6 0 5 86 0 0 0 7")
     text["/proc/stat"] = later
@@ -47,7 +47,7 @@ def test_stolen_time_is_that_of_the_cores_in_use(monkeypatch: pytest.MonkeyPatch
 
 
 def test_what_linux_does_not_say_is_not_made_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine_conditions, "_text", lambda path: "")
+    monkeypatch.setattr(machine_conditions, "text_of", lambda path: "")
     found = MachineCounters([0]).conditions()
     assert (found.steal, found.governor, found.frequency_mhz) == (None, None, (None, None))
     assert processor() == os.uname().machine

@@ -22,8 +22,8 @@ def test_check_sums_up_a_cell(cell: Path) -> None:
     for words in ("small: no faults", "can move: plan (R, E)", "scenarios: baseline, stress"):
         assert words in result.stdout
     rows = [line.split() for line in result.stdout.splitlines()]
-    assert ["LOC", "9.0", "0.0", "45", "0"] in rows
-    assert ["OFF", "4.0", "0.0", "5", "2"] in rows
+    assert ["LOC", "9.0", "0.00", "45", "0"] in rows
+    assert ["OFF", "4.0", "0.00", "5", "2"] in rows
 
 
 def test_check_as_json(cell: Path) -> None:
@@ -248,7 +248,7 @@ def test_check_says_why_shadows_are_few(cell: Path) -> None:
     cell.write_text(f"{auto}, min_improvement: 0.2}}\n", encoding="utf-8")
     said = call("check", cell).stdout
     assert "shadows: 0.05 under OFF\n" in said
-    assert re.search(r"^shadows: 0.01; at 0.05 LOC would miss 4.\d points more$", said, re.M)
+    assert re.search(r"^shadows: 0.01; at 0.05 LOC would miss 4\.\d\d points more$", said, re.M)
     found = read_json(call("check", cell, "--json"))["candidates"]
     assert {name: one["shadow_fraction"] for name, one in found.items()} == {
         "LOC": 0.01,

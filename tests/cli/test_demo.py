@@ -26,7 +26,7 @@ def test_demo_as_json(tmp_path: Path) -> None:
     found = read_json(call("demo", *arguments))
     rows = found["comparisons"]["canonical"]
     twice = {"DTP as printed", "DTP"}
-    others = {"LOC", "SO", "HYB", "atp", "dtp without caps", "latency-first", "cusum+corrected"}
+    others = {"LOC", "SO", "HYB", "atp", "latency-first", "cusum+corrected"}
     assert {row["policy"] for row in rows} == others | twice
     assert {row["seeds"] for row in rows} == {1}
 

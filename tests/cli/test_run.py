@@ -27,8 +27,7 @@ def test_cycles_on_their_way_when_a_run_ends_are_told_apart_from_lost_ones(cell:
     assert row["lost"] == 0
     assert row["in_flight"] > row["cycles"] / 2
     text = call(*arguments, "--out", "two").stdout
-    assert f"{row['in_flight']} of {row['cycles']}" in text
-    assert "unfinished at the end" in text
+    assert re.search(rf"^unfinished at the end +{row['in_flight']}$", text, re.MULTILINE)
     assert "inf" not in text
     assert "unfinished" not in call("run", cell, "--policy", "OFF", "--out", "three").stdout
 
@@ -61,9 +60,10 @@ def test_it_ends_with_a_verdict_and_with_what_other_placements_would_have_done(c
 
 def test_a_saved_run_without_them_can_be_made_again(cell: Path) -> None:
     call("run", cell, "--out", "here")
-    first = dwell.open_run("here")
-    bare = Run({k: v for k, v in first.meta.items() if k != "placements"}, first._tables)
-    bare.save("here")
+    file = Path("here", "run.json")
+    meta = json.loads(file.read_text())
+    del meta["placements"]
+    file.write_text(json.dumps(meta))
     assert call("run", cell, "--out", "here").exit_code == 0
 
 
@@ -364,7 +364,7 @@ def test_a_cell_of_many_candidates_is_run_and_its_record_opens(tmp_path: Path) -
     cell.write_text(yaml.safe_dump(document_of(100), sort_keys=False), encoding="utf-8")
     result = call("run", cell, "--windows", "2", "--out", folder)
     assert (result.exit_code, result.stderr) == (0, "")
-    assert "windows by placement           R-R-R 100%\n" in result.stdout
+    assert re.search(r"^windows by placement +R-R-R 100 %$", result.stdout, re.MULTILINE)
     assert dwell.open_run(folder).problem.shadow_fraction == 1 / 99
     given = ("--windows", "2", "--out", tmp_path / "given", "--set")
     assert call("run", cell, *given, "controller.shadow_fraction=0.01").exit_code == 0

@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import polars as pl
 import pytest
 from playwright.sync_api import Browser, Page
 
@@ -110,12 +111,12 @@ def test_what_makes_no_sense_of_a_fleet_is_refused_by_name(
     assert (code, "a fleet; name the folder of one of its cells" in said) == (2, True)
 
 
-def test_without_fleet_json_its_runs_are_named(fleet_folder: Path, tmp_path: Path) -> None:
+def test_without_fleet_json_its_runs_are_listed(fleet_folder: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(fleet_folder, tmp_path / "pack")
     (folder / FLEET).unlink()
-    code, said = ran(folder)
-    assert code == 2
-    assert "no fleet (it has no fleet.json); it holds small-01, small-02, small-03" in said
+    with serving(tmp_path, folder) as served:
+        listed = served.get("/cells")["runs"]["runs"]
+        assert listed == ["small-01", "small-02", "small-03"]
     (folder / FLEET).write_text("{")
     code, said = ran(folder)
     assert (code, "fleet.json: cannot be read" in said) == (2, True)
@@ -164,7 +165,10 @@ def test_small_multiples_say_how_every_cell_is(shown: Page, served: Served) -> N
     names = [cell["name"] for cell in fleet["cells"]]
     assert shown.locator(".small h4 a").all_inner_texts() == names
     assert shown.locator(".fleet .name").first.inner_text() == "pack"
-    assert names[0] in shown.locator(".facts").inner_text()
+    assert names[0] in shown.locator(".verdict").first.inner_text()
+    assert all(cell["verdict"] in ("kept", "missed", "open") for cell in fleet["cells"])
+    rates = shown.locator(".small .rate").all_inner_texts()
+    assert [rate.split(": ")[1] for rate in rates] == [cell["verdict"] for cell in fleet["cells"]]
     shown.evaluate("window.page.moveTo(4.003)")
     settled(shown)
     state = served.get("/state?at=4.003")
@@ -186,6 +190,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
     name = shown.locator(".small h4 a").first.inner_text()
     shown.locator(".small").first.click()
     wait_for_page(shown, "**/cell/*")
+    settled(shown)
     assert shown.evaluate("window.page.at") == 3
     assert shown.locator(".source").inner_text() == name
     assert f"of {runs.cells[name].cycles.height} cycles" in shown.locator(".facts").inner_text()
@@ -275,3 +280,12 @@ def test_markup_in_the_names_of_a_fleet_is_only_text(
         assert MARKUP in shown.locator("#back-to-fleet").inner_text()
         assert shown.evaluate("window.pwned") is None
         assert shown.locator("main img, main script").count() == 0
+
+
+@in_browser
+def test_a_violation_rate_has_two_decimals_and_a_lowered_index(shown: Page, runs: FleetRun) -> None:
+    texts = [text.inner_html() for text in shown.query_selector_all(".small .rate")]
+    rates = [text.partition(":")[0] for text in texts]
+    windows = runs.windows.filter(~runs.windows["warmup"])
+    means = windows.group_by("cell").agg(pl.col("violation_rate").mean())["violation_rate"]
+    assert rates == [f"V<sub>D</sub> {100 * rate:.2f} %" for rate in sorted(means, reverse=True)]

@@ -18,6 +18,8 @@ from tests.dash.served import Served, serving
 
 pytestmark = in_browser
 
+#: Ends of the scales of latency, J and load, by cell.
+SCALES = """window.page.cells.map((cell) => cell.charts.scales())"""
 MARKUP = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>"
 
 
@@ -59,6 +61,40 @@ def test_it_says_how_many_missed_and_draws_something(shown: Page, run: dwell.Run
         return red;
     }""")
     assert reds > 100
+
+
+def test_it_opens_on_the_verdict_the_worst_window_and_the_whole_run(
+    shown: Page, page: Served
+) -> None:
+    (told,) = page.get("/cells")["cells"]
+    assert told["verdict"]["text"] in shown.locator(".verdict").inner_text()
+    assert shown.evaluate("window.page.at") == told["worst"]["at"]
+    assert view(shown) == [told["begin"], told["end"]]
+    settled(shown)
+    window = f"window {told['worst']['number']},"
+    assert window in shown.locator(".against caption").inner_text()
+    shown.get_by_role("button", name="Worst").click()
+    settled(shown)
+    begin, end = view(shown)
+    assert end - begin == pytest.approx(0.6)
+    assert begin < told["worst"]["at"] < end
+
+
+def test_the_jobs_have_the_time_axis_of_the_strips(shown: Page) -> None:
+    shown.get_by_role("button", name="Cycles").click()
+    settled(shown)
+    box = shown.locator(".latency .u-over").bounding_box()
+    plot = shown.locator(".gantt .plot").bounding_box()
+    assert box is not None
+    assert plot is not None
+    begin, end = view(shown)
+    releases = shown.locator(".gantt .release").evaluate_all(
+        "lines => lines.map((line) => Number(line.getAttribute('x1')))"
+    )
+    each = 0.02 / (end - begin) * box["width"]
+    first = (-(-begin // 0.02) * 0.02 - begin) / (end - begin) * box["width"]
+    expected = [box["x"] - plot["x"] + first + i * each for i in range(len(releases))]
+    assert releases == pytest.approx(expected, abs=1.5)
 
 
 def test_the_token_is_not_left_in_the_address(shown: Page, page: Served) -> None:
@@ -110,7 +146,7 @@ def test_dragging_zooms_to_the_cycles_and_each_job_stands_on_its_node(
     jobs = run.jobs.filter(run.jobs["start_ns"].is_not_null())
     first = -(-begin // 0.02)
     numbers = [int(first) + i for i in range(cycles)]
-    mine = jobs.filter(jobs["cycle"].is_in(numbers))
+    mine = jobs.filter(jobs["cycle"].is_in(numbers) & (jobs["start_ns"] < end * 1e9))
     assert shown.locator(".gantt .job").count() == mine.height
     labels = shown.locator(".gantt text.muted").all_text_contents()
     assert set(labels) == {"sense@R", "plan@R", "plan@E"}
@@ -137,6 +173,7 @@ def test_all_of_it_is_reached_by_keys_alone(shown: Page) -> None:
     assert view(shown)[1] < 1
     shown.keyboard.press("0")
     assert view(shown)[1] > 10
+    shown.keyboard.press("Home")
     shown.keyboard.press("ArrowRight")
     assert shown.evaluate("window.page.at") == pytest.approx(0.2)
     shown.keyboard.press("End")
@@ -200,6 +237,17 @@ def test_two_runs_stand_on_one_time_line(browser: Browser, tmp_path: Path) -> No
         assert "cycle 200" in shown.locator("#place").inner_text()
         facts = shown.locator(".facts").all_inner_texts()
         assert all("cycle 200" in fact for fact in facts)
+        tops = [
+            [shown.locator(f".{part}").nth(i).bounding_box() for i in (0, 1)]
+            for part in ("latency", "ribbon", "costs", "used")
+        ]
+        assert all(one and other and one["y"] == other["y"] for one, other in tops)
+        ends = shown.evaluate(SCALES)
+        assert ends[0] == ends[1]
+        assert "LOC less dtp" in shown.locator("#difference").inner_text()
+        shown.set_viewport_size({"width": 400, "height": 800})
+        settled(shown)
+        assert shown.evaluate("document.documentElement.scrollWidth") <= 400
     with serving(tmp_path, tmp_path / "dtp", "--beside", tmp_path / "other") as served:
         assert "by seconds" in served.get("/cells")["line"]
 

@@ -9,8 +9,9 @@ import polars as pl
 import pytest
 
 import dwell
-from dwell.dash.recorded_cell import RecordedCell, same_realisation
+from dwell.dash.recorded_cell import RecordedCell, difference, same_realisation
 from dwell.errors import RunError
+from dwell.study.verdict import verdict_of
 from tests.cells.late_cycles import late_run, without_late_cycles
 from tests.dash.recorded import small_run
 
@@ -124,6 +125,76 @@ def test_disturbances_stand_among_the_events(tmp_path: Path) -> None:
     view = RecordedCell(tmp_path / "run").view(0.0, 20.0, 50)
     at = [event["at"] for event in view["events"] if event["kind"] == "disturbance"]
     assert at == [2.0, 5.0]
+
+
+def stressed(folder: Path, **changes: object) -> RecordedCell:
+    """Return a run whose stress of R has other times."""
+    run = small_run(folder)
+    run.meta["problem"]["scenarios"]["stress"][0].update(changes)
+    tables = {name: getattr(run, name) for name in ("cycles", "windows", "decisions")}
+    dwell.Run(run.meta, tables).save(folder)
+    return RecordedCell(folder)
+
+
+def test_disturbances_are_shown_while_they_act(tmp_path: Path) -> None:
+    cell = stressed(tmp_path / "run", at_s=2.0, for_s=3.0)
+    assert cell.described()["disturbed"] == [(2.0, 5.0)]
+    assert cell.state(1.9)["disturbed"] == {}
+    (text,) = cell.state(2.1)["disturbed"].values()
+    assert "busy thread" in text
+    assert cell.state(5.0)["disturbed"] == {}
+
+
+def test_a_run_has_a_verdict_its_moves_and_its_worst_window(
+    cell: RecordedCell, run: dwell.Run
+) -> None:
+    told = cell.described()
+    counted = run.windows.filter(~pl.col("warmup"))
+    missed = run.cycles["missed"].to_numpy()[-counted.height * 10 :]
+    verdict = verdict_of(run, run.problem, missed.mean())
+    assert told["verdict"]["word"] == verdict.word
+    assert told["verdict"]["text"] == str(verdict)
+    assert told["moves"]["migrations"] > 0
+    assert told["worst"]["rate"] == counted["violation_rate"].max()
+    assert cell.state(told["worst"]["at"])["window"]["number"] == told["worst"]["number"]
+    json.dumps(told, allow_nan=False)
+
+
+def test_a_run_that_is_all_warm_up_has_no_verdict(tmp_path: Path) -> None:
+    run = small_run(tmp_path / "run", windows=12)
+    tables = {name: getattr(run, name) for name in ("cycles", "windows", "decisions")}
+    tables["windows"] = tables["windows"].with_columns(warmup=pl.lit(value=True))
+    dwell.Run(run.meta, tables).save(tmp_path / "run")
+    told = RecordedCell(tmp_path / "run").described()
+    assert "verdict" not in told
+    assert told["worst"] is None
+
+
+@pytest.mark.parametrize(("policy", "shown"), [("dtp", "DTP"), ("LOC", "LOC, without moves")])
+def test_a_policy_is_shown_without_its_parameters(tmp_path: Path, policy: str, shown: str) -> None:
+    small_run(tmp_path / "run", policy=policy)
+    assert RecordedCell(tmp_path / "run").described()["about"]["policy"] == shown
+
+
+def test_placements_without_moves_are_shown_next_to_the_run(tmp_path: Path) -> None:
+    run = small_run(tmp_path / "run")
+    others = {"LOC": {"violation_rate": 0.25, "l95_ms": 1.0, "cost": 1.0}}
+    run.with_facts(placements=others).save(tmp_path / "other")
+    assert RecordedCell(tmp_path / "other").described()["never_moving"] == {"LOC": 0.25}
+
+
+def test_the_difference_of_two_runs_is_v_d_of_the_second_less_the_first(tmp_path: Path) -> None:
+    for policy in ("dtp", "LOC"):
+        small_run(tmp_path / policy, policy=policy)
+    one, other = (RecordedCell(tmp_path / policy, "cycle") for policy in ("dtp", "LOC"))
+    found = difference(one, other, 0.0, 600.0, 100)
+    rates = [
+        cell.run.cycles["missed"].to_numpy().reshape(-1, 10).mean(axis=1) for cell in (one, other)
+    ]
+    assert found["points"] == pytest.approx(100 * (rates[1] - rates[0]), abs=1e-3)
+    assert len(difference(one, other, 0.0, 600.0, 7)["points"]) <= 7
+    same = difference(one, one, 0.0, 600.0, 100)["points"]
+    assert set(same) == {0.0}
 
 
 def test_episodes_stand_among_the_events_as_they_were_drawn(tmp_path: Path) -> None:

@@ -144,7 +144,7 @@ def test_where_the_disk_has_room_again_it_goes_on(
     assert counted(file) == (8, 5, 3)
     assert [one["cycle"] for _, one in of_topic(file, "/cycles")] == [0, 1, 5, 6, 7]
     assert said == [
-        f"error: {file}: cannot be written (No space left on device); what is heard is dropped",
+        f"error: {file}: cannot be written (No space left on device); new rows are dropped",
         f"{file}: can be written again; 3 cycles and windows were dropped",
         f"{file}: 5 cycles and windows recorded + 3 dropped = 8 published",
     ]

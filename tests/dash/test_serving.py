@@ -18,8 +18,9 @@ import dwell
 from dwell.record import seal_run
 from dwell.record.journal import JOURNAL
 from tests.cli.small_cell import CANONICAL, environment
-from tests.dash.recorded import WrittenRun, small_run
+from tests.dash.recorded import WrittenRun
 from tests.dash.served import dash, serving, until
+from tests.waiting import PATIENCE_S
 
 LIVE = ("msgspec", "zenoh", "cryptography", "psutil")
 TABLES = ("polars", "scipy")
@@ -33,6 +34,8 @@ def ran(*arguments: str | Path, without: Sequence[str] = ()) -> tuple[int, str]:
         text=True,
         env=environment(),
         check=False,
+        # A command that serves in place of refusing would never end.
+        timeout=PATIENCE_S,
     )
     assert done.stdout == ""
     assert "Traceback" not in done.stderr
@@ -156,19 +159,10 @@ def test_without_a_display_it_is_served_all_the_same(tmp_path: Path, run_folder:
 # ---------------------------------------------------------------------------- what is shown
 
 
-def test_a_folder_of_runs_names_them(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        small_run(tmp_path / "both" / name, windows=20)
-    code, said = ran(tmp_path / "both")
-    assert code == 2
-    assert "it holds one, two: name one of them" in said
-    assert "--beside" in said
-
-
 def test_what_is_no_run_is_told_so(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     code, said = ran(tmp_path / "empty")
-    assert (code, "not a run" in said) == (2, True)
+    assert (code, "no run and no fleet" in said) == (2, True)
     code, said = ran(tmp_path / "none")
     assert (code, "no such file" in said) == (2, True)
     code, said = ran()

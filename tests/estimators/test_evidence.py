@@ -38,5 +38,5 @@ def test_instants_of_some_cycles_are_rows_of_all(rows: Rows) -> None:
 def test_it_says_how_many_cycles_had_a_shadow() -> None:
     release, placement = np.arange(3), np.zeros(3, np.int64)
     through = np.array([-1, 2, -1])
-    evidence = Evidence(9, release, placement, instants(3), through, instants(3))
+    evidence = Evidence.of(9, release, placement, instants(3), through, instants(3))
     assert repr(evidence) == "<Evidence of 3 cycles, 1 of them with a shadow>"

@@ -204,14 +204,12 @@ def shown(work_ms: Sequence[float | None], *, start_ms: bool = True, work: bool 
     cycles = evidence.cycles
     start_ns = np.where(cycles.ready_ns > 0, cycles.ready_ns + 2 * MS, cycles.ready_ns)
     known = [-1 if ms is None else round(ms * MS) for ms in work_ms]
-    return replace(
-        evidence,
-        cycles=replace(
-            cycles,
-            start_ns=start_ns if start_ms else None,
-            work_ns=np.array([known]) if work else None,
-        ),
+    cycles = replace(
+        cycles,
+        start_ns=start_ns if start_ms else None,
+        work_ns=np.array([known]) if work else None,
     )
+    return evidence.with_instants(cycles, evidence.shadows)
 
 
 E4 = Node("E", "edge", 4)

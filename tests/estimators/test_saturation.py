@@ -216,7 +216,7 @@ def cycles(placement: int, begun_ms: float, ended_ms: float, work_ms: float) -> 
     shown = window(rows, close_ms=400.0, release_ms=starts, placement=[placement] * 10)
     work_ns = np.full_like(shown.cycles.end_ns, [MS, round(work_ms * MS)])
     known = replace(shown.cycles, start_ns=shown.cycles.ready_ns, work_ns=work_ns)
-    return replace(shown, cycles=known)
+    return shown.with_instants(known, shown.shadows)
 
 
 def test_load_that_is_seen_once_the_cell_has_left_is_no_change() -> None:

@@ -65,8 +65,8 @@ class Witness(Corrected):
         super().start(problem)
         self.meter, self.windows = Meter(problem), 0
 
-    def _take_in(self, demands: object, evidence: Evidence) -> None:
-        super()._take_in(demands, evidence)  # type: ignore[arg-type]
+    def _take_in(self, evidence: Evidence) -> None:
+        super()._take_in(evidence)
         waited_ns = self.meter.waited_ns(evidence, self._threads)
         np.testing.assert_array_equal(waited_ns, evidence.cycles.work_ns)
         self.windows += 1
@@ -106,7 +106,7 @@ def test_a_device_that_a_job_waits_for_is_part_of_its_demand() -> None:
     meter, column = Meter(problem), list(problem.pipeline.tasks).index("planning")
     half_ns = cycles.work_ns.copy()
     half_ns[:, column] //= 2
-    halved = replace(kept[0], cycles=replace(cycles, work_ns=half_ns))
+    halved = kept[0].with_instants(replace(cycles, work_ns=half_ns), kept[0].shadows)
     site = Site("planning", "R2")
     whole = meter.demands(kept[0])[site].copy()
     np.testing.assert_allclose(meter.demands(halved)[site], whole, rtol=1e-6)

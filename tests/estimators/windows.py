@@ -47,7 +47,7 @@ def window(
     nothing = [[None] * len(part) for part in rows[0]]
     sent = [row is not None for row in shadows or [None] * count]
     other = [1] * count if through is None else list(through)
-    return Evidence(
+    return Evidence.of(
         close_ns=round(close_ms * MS),
         release_ns=_table([release_ms or [0.0] * count])[0],
         placement=np.array(placement or [0] * count, np.int16),

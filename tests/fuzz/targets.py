@@ -27,7 +27,7 @@ from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.roster import Roster
 from dwell.live.trust.signing import Seals
 from dwell.live.wire import messages
-from dwell.live.wire.keys import TWICE, Keys
+from dwell.live.wire.keys import RELAYED, Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
     Beat,
@@ -40,7 +40,7 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.payloads import read_payload
 from dwell.live.wire.transport import Arrival
 from tests.cells.once import with_windows
-from tests.live.small_world import Bench, Passing, World
+from tests.live.small_world import Bench, Passing, World, forget_jobs
 
 NODES = ("R1", "E", "R2")
 DAY_NS = 86_400_000_000_000
@@ -98,7 +98,7 @@ def _world(*, keys: bool) -> World:
     found.run(300)
     for role in found.roles.values():
         if isinstance(role, Bench):
-            role.worker._jobs.clear()
+            forget_jobs(role.worker)
             role.worker.stage = _Alarm(role.worker.task)
     return found
 
@@ -111,6 +111,7 @@ def _keys() -> tuple[str, ...]:
         *(keys.command("control"), keys.done("control"), keys.ended(), keys.stamped()),
         *(keys.frame(), keys.order(), keys.accepted(), keys.load("E"), keys.restored()),
         *(keys.beat("R1", "stamper@R1"), keys.beat("E", "agent@E"), keys.snapshot("planning", "E")),
+        *(keys.beats("E"), keys.missed()),
         *(keys.state("planning", "E"), keys.ask(), keys.look(), keys.carried(), keys.gathered()),
     ]
     return *plain, *(keys.detour(key) for key in plain), *(keys.relay(key) for key in plain)
@@ -161,7 +162,7 @@ def read_bundle(data: bytes) -> None:
     """As it comes over the detour."""
     place = _world(keys=False).stamper.place
     for sample in place.around(Arrival(place.keys.carried(), data)):
-        assert place.keys.word(sample.key) in TWICE
+        assert place.keys.word(sample.key) in RELAYED
         assert len(sample.payload) <= len(data)
 
 
@@ -195,16 +196,20 @@ def reach_roles(data: bytes) -> None:
 def reach_sealed_roles(data: bytes) -> None:
     """With keys nothing may move, either."""
     world = _world(keys=True)
-    stamper = world.stamper
-    before = stamper.term, stamper.placement, stamper.cycle, stamper._newest, len(world.arm.applied)
+    before = _course(world)
     _hear(world, data)
     for role in world.roles.values():
-        if isinstance(role, Bench) and role.worker._jobs:
-            role.worker._jobs.clear()
+        if isinstance(role, Bench) and forget_jobs(role.worker):
             raise ReachedError(f"{role.worker.place.who} would call its stage")
-    after = stamper.term, stamper.placement, stamper.cycle, stamper._newest, len(world.arm.applied)
+    after = _course(world)
     if after != before:
         raise ReachedError(f"{before} has become {after}")
+
+
+def _course(world: World) -> tuple[int, str, int, int, int]:
+    """Return what no message without a signature may change."""
+    stamper, applied = world.stamper, len(world.arm.applied)
+    return stamper.term, stamper.placement, stamper.cycle, stamper.newest_order, applied
 
 
 def keep_deciding(data: bytes) -> None:
@@ -257,7 +262,15 @@ def _next_messages(world: World, cell: ControlledCell) -> list[tuple[str, msgspe
     who = stamper.run, stamper.cycle, stamper.term, stamper.placement
     keys = world.keys
     done = Completion(messages.Stamp(*who, now_ns), "control", now_ns, "actuated", (), "R2")
-    told = cell._number, cell.name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle
+    told = (
+        cell.order_number,
+        cell.name,
+        "",
+        stamper.run,
+        stamper.term,
+        stamper.placement,
+        stamper.cycle,
+    )
     return [
         (keys.stamped(), messages.Stamped(*who, now_ns)),
         (keys.done("control"), done),
@@ -300,6 +313,8 @@ def wholes() -> list[msgspec.Struct]:
         Completion(STAMP, "control", 9, "actuated", (HOP,), "R2"),
         messages.Heard("stamper@R1", "R1", 1, 2),
         Beat("agent@E", "E", 1, 5, True, (messages.Heard("stamper@R1", "R1", 1, 2),), cell="x"),
+        messages.Beats((Beat("agent@E", "E", 1, 5, True), Beat("planning@E", "E", 1, 4, True))),
+        messages.Receipt(1, 5, {"planning@E": 4}, (0, -9, 9)),
         Order(1, "me", 1, 1, "SO", 0.5, (("planning", "E"),)),
         Carried((("beat/E/agent@E", b"b"), ("done/control", b"c"))),
         messages.Ask("me", "pin", "SO"),

@@ -86,3 +86,20 @@ def test_more_than_keys_can_name_is_refused(
     monkeypatch.setattr(codes, "MOST_FLOWS", 2)
     with pytest.raises(SimulationError, match="3 flows of a cell are more than the simulator's 2"):
         lay_out([(canonical, real)])
+
+
+def test_cells_left_out_of_a_copy_change_nothing_for_the_others(canonical: Problem) -> None:
+    reals = [dwell.draw(canonical, scenario="baseline", seed=3 + i, windows=4) for i in range(3)]
+    kept = [0, 2]
+    first, alone = (
+        lay_out([(canonical, reals[i]) for i in rows], shared={"E"}) for rows in (range(3), kept)
+    )
+    for arrays in (first, alone):
+        arrays.tables.stamps[:] = list(canonical.candidates).index("SO")
+    part = first.copy()
+    part.leave_out({1})
+    for arrays in (part, alone):
+        assert play(arrays) == Status.FINISHED
+    for name in OUTPUTS:
+        assert np.array_equal(getattr(part.tables, name)[kept], getattr(alone.tables, name)), name
+    assert not part.tables.seen["cycles"][1].any()

@@ -43,7 +43,7 @@ def random_evidence(rng: np.random.Generator, problem: Problem) -> Evidence:
     placement = np.where(np.arange(count) < rng.integers(0, 2 * count), active[0], active[1])
     through = rng.integers(-1, names, count)
     has_shadows = rng.random() < 0.7
-    return Evidence(
+    return Evidence.of(
         close_ns=10**12,
         release_ns=np.arange(count) * 1_000_000,
         placement=placement,
@@ -129,3 +129,4 @@ def test_what_is_not_known_of_a_window(seed: int) -> None:
         behind = (shadows.end_ns >= 0) & (shadows.work_ns < 0)
     found = evidence.rows.unknown(limit_ns)
     assert found == (bool(lost.any()), bool(unknown.any()), bool(behind.any()))
+    assert evidence.rows.candidates(limit_ns) == sorted(set(evidence.placement.tolist()))

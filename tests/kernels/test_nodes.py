@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import dwell
-from dwell.kernels.advance import logged_window, play
+from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import CellArrays, lay_out
 from dwell.kernels.codes import Status
 from dwell.kernels.realisation import NodeChange
@@ -252,6 +252,6 @@ def test_core_time_is_more_than_work_where_foreign_threads_interfere(
     real = make_realisation(problem, windows=1, node_changes=changes)
     arrays = lay_out([(problem, real)], log_jobs=True)
     assert play(arrays) == Status.FINISHED
-    rows = logged_window(CellArrays(arrays), 0, 1, np.empty(0, np.int64))
+    rows = LoggedCycles(CellArrays(arrays), np.empty(0, np.int64)).window(0, 1)
     *_, work_ns, start_ns = rows.columns(shadow=False)
     assert (start_ns.tolist(), work_ns.tolist()) == ([[0]], [[round(core_ms * MS)]])

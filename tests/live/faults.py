@@ -135,7 +135,7 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
 
 
 def table(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Return the table of `docs/reference/faults.md`."""
+    """Return the table of `reproduction/evidence/faults.md`."""
     yield (
         "| fault | n | cycles lost, median (most) | without actuation, ms, median (most) | "
         "at home again, s, median (most) | beyond the bound |"

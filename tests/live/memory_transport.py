@@ -159,7 +159,7 @@ class MemoryTransport:
         self.clock = clock
         self.closed = False
         self.frozen = False
-        self._network = network
+        self.network = network
         self._subscriptions: list[tuple[Callable[[str], bool], Receive]] = []
         #: By key: who is called with a message under it.
         self._receivers: dict[str, tuple[Receive, ...]] = {}
@@ -170,14 +170,14 @@ class MemoryTransport:
     @property
     def now_ns(self) -> int:
         """What the clock of its node shows."""
-        return self.clock.shown(self._network.now_ns)
+        return self.clock.shown(self.network.now_ns)
 
     def put(
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
     ) -> None:
         """Send a message; returns at once, whatever the receivers do."""
         if not self.closed:
-            self._network.send(self, Arrival(key, bytes(payload), bytes(header)), lane)
+            self.network.send(self, Arrival(key, bytes(payload), bytes(header)), lane)
 
     def subscribe(self, key: str, receive: Receive) -> None:
         """Have `receive` called with every message under a key expression (``*``, ``**``)."""
@@ -185,7 +185,7 @@ class MemoryTransport:
         if not self.closed:
             self._subscriptions.append((matches, receive))
             self._receivers.clear()
-            self._network.rewire()
+            self.network.rewire()
 
     def receivers(self, key: str) -> tuple[Receive, ...]:
         """Return what was subscribed with key expressions that a key is under, in order."""
@@ -203,7 +203,7 @@ class MemoryTransport:
             self._receivers.clear()
             self.inbox.clear()
             self.wakes.clear()
-            self._network.forget(self)
+            self.network.forget(self)
 
 
 class Network:

@@ -65,11 +65,11 @@ class Played:
 
 def simulate(problem: Problem, scenario: str, windows: int = 25, seed: int = 5) -> Played:
     """Simulate a run and keep what its controller was given."""
-    kept: list[tuple[Seen, engine._Stamper]] = []
-    decide, every = engine._Stamper._decide, problem.decide_cycles
+    kept: list[tuple[Seen, engine.SimulatedStamper]] = []
+    consult, every = engine.SimulatedStamper.consult, problem.decide_cycles
     often = every < problem.window_cycles
 
-    def spy(self: engine._Stamper, index: int, boundary: int, close_ns: int) -> None:
+    def spy(self: engine.SimulatedStamper, index: int, boundary: int, close_ns: int) -> None:
         if not kept:
             kept.append((Seen(self.controller), self))
         seen, tables, release_ns = kept[0][0], self.arrays.tables, self.release_ns
@@ -94,17 +94,17 @@ def simulate(problem: Problem, scenario: str, windows: int = 25, seed: int = 5) 
         assert self.evidence is not None
         seen.evidence.append(self.evidence(first, boundary, close_ns))
         seen.firsts.append(first)
-        decide(self, index, boundary, close_ns)
+        consult(self, index, boundary, close_ns)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(engine._Stamper, "_decide", spy)
+        patch.setattr(engine.SimulatedStamper, "consult", spy)
         run = dwell.simulate(problem, scenario=scenario, seed=seed, windows=windows, jobs=True)
     seen, stamper = kept[0]
     if often:
         tables = stamper.arrays.tables
         for index, first in enumerate(run.windows["first_cycle"]):
             beyond = first + problem.window_cycles
-            at_ns = int(stamper.release_ns[first]), stamper._close_ns(beyond)
+            at_ns = int(stamper.release_ns[first]), stamper.close_ns(beyond)
             work = tables.opened[0, index, :3], tables.closed[0, index, :3]
             seen.work += zip(at_ns, work, strict=True)
     return Played(problem, run, seen)

@@ -24,7 +24,7 @@ from dwell.live.roles.worker import Chore, Job, Worker
 from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.trust.signing import Seals
 from dwell.live.wire.keys import CONTROLLER, Keys
-from dwell.live.wire.messages import Ask, Order, StageCounts, encode
+from dwell.live.wire.messages import Accepted, Ask, Order, StageCounts, decode, encode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role, roles, wire
 from dwell.model import Host, Problem, QoS
@@ -183,6 +183,32 @@ class MemoryRecorder:
             self.rows.setdefault(table, []).extend(found)
 
 
+def queued(worker: Worker) -> tuple[int, int, list[int]]:
+    """Return how many jobs, jobs of shadows, and inputs per join wait at a worker."""
+    joins = [len(joins.waiting) for joins in worker._joins.values()]
+    return len(worker._jobs), len(worker._forked), joins
+
+
+def forget_jobs(worker: Worker) -> bool:
+    """Remove the waiting jobs of a worker; returns whether there were any."""
+    waited = bool(queued(worker)[0])
+    worker._jobs.clear()
+    return waited
+
+
+class MemorySlots:
+    """Slots of a node's processes that outlive them."""
+
+    def __init__(self, slots: dict[str, bytes], who: str) -> None:
+        self.slots, self.who = slots, who
+
+    def write(self, content: bytes) -> None:
+        self.slots[self.who] = content
+
+    def read(self, who: str) -> bytes:
+        return self.slots.get(who, b"")
+
+
 class Bench:
     """Drives a worker: runs its jobs for as long as they take.
 
@@ -315,6 +341,8 @@ class World:
         self.roles: dict[str, object] = {}
         #: By worker: the memory of its counts, which outlives it.
         self.books: dict[str, bytearray] = {}
+        #: By node: the slots of its processes.
+        self.slots: dict[str, dict[str, bytes]] = {node: {} for node in problem.fabric.nodes}
         self.lives = 0
         self.run_id = 1
         self.boot = ""
@@ -335,6 +363,8 @@ class World:
         subject = CONTROLLER if role.kind == "controller" else role.node
         seals = self.seals.get(subject)
         place = RolePlace(self.problem, who, role.node, end, self.life_of(role), seals=seals)
+        if role.kind != "controller":
+            place.slots = MemorySlots(self.slots[role.node], who)
         made: Stamper | Sink | Quiet | ControlledCell | Bench
         if role.kind == "stamper":
             made = Stamper(place, self.book, self.time_of_day(role), end.now_ns, self.boot)
@@ -409,9 +439,24 @@ class World:
         self.number += 1
         stamper = self.stamper
         order = Order(self.number, controller, run or stamper.run, term or stamper.term, placement)
-        stamper.receive(self.sample(order), self.network.now_ns)
-        assert stamper._answered is not None
-        return stamper._answered[2].refused
+        return self.answer(order).refused
+
+    def answer(self, order: Order) -> Accepted:
+        """Hand an order to the stamper; returns its answer."""
+        answers: list[bytes] = []
+
+        def hear(sample: Arrival) -> None:
+            if sample.key == self.keys.accepted():
+                answers.append(sample.payload)
+
+        self.network.taps.append(hear)
+        self.stamper.receive(self.sample(order), self.network.now_ns)
+        self.network.taps.remove(hear)
+        return decode(answers[-1], Accepted)
+
+    def move_by_guard(self, placement: str) -> None:
+        """Have the stamper move the cell, as its guard does."""
+        self.stamper._move(placement, by_guard=True)
 
     @staticmethod
     def losing(share: float) -> NetworkConditions:

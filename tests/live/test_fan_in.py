@@ -41,8 +41,9 @@ def test_both_sources_begin_a_cycle_together(problem: Problem, offset_s: int) ->
         cycles = [cycle for cycle, _ in arm.applied]
         assert len(cycles) > 50
         assert all(later - earlier == 1 for earlier, later in pairwise(cycles[5:]))
-    source = world.worker("wrist_camera@R2")
-    last = source._source._last if source._source is not None else None
+    source = world.worker("wrist_camera@R2")._source
+    assert source is not None
+    last = source._last
     assert last is not None
     # The stamp was there before its cycle began: the source has waited for that instant.
     assert last.stamp.cycle >= world.stamper.cycle - 1

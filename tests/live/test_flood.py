@@ -21,7 +21,7 @@ from dwell.live.wire.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBat
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
 from tests.fuzz.targets import seeds
-from tests.live.small_world import EXEC_MS, Bench, World
+from tests.live.small_world import EXEC_MS, Bench, World, queued
 
 MS = 1_000_000
 KB = 1 << 10
@@ -172,9 +172,10 @@ def test_processes_that_a_node_makes_up_are_not_remembered() -> None:
     loads = ProcessLoads()
     for number in range(20):
         loads.report("E", number, [(f"{number}-{each}", 1) for each in range(1_000)])
-    assert len(loads._of) == len(loads._read) == MOST_PROCESSES
+    known = loads._of
+    assert len(known) == len(loads._read) == MOST_PROCESSES
     loads.report("R1", 1, [("sensing@R1", 5)])
-    assert ("R1", "sensing@R1") in loads._of
+    assert ("R1", "sensing@R1") in known
 
 
 def test_the_controller_believes_no_placement_that_is_no_candidate() -> None:
@@ -228,7 +229,6 @@ def queues(world: World) -> list[int]:
     found = []
     for role in world.roles.values():
         if isinstance(role, Bench):
-            worker = role.worker
-            found += [len(worker._jobs), len(worker._forked)]
-            found += [len(joins.waiting) for joins in worker._joins.values()]
+            jobs, forked, joins = queued(role.worker)
+            found += [jobs, forked, *joins]
     return found

@@ -33,7 +33,7 @@ class Listener:
 
 
 def send(end: MemoryTransport, count: int, *, every_ns: int = 0, lane: Lane = "control") -> None:
-    network = end._network
+    network = end.network
     for i in range(count):
         at_ns = network.now_ns + i * every_ns
         network.call_at(at_ns, lambda i=i: end.put("k", b"%d" % i, lane=lane))  # type: ignore[misc]

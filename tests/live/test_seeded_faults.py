@@ -71,6 +71,14 @@ def test_there_are_300_faults_of_every_kind() -> None:
 # ---------------------------------------------------------------------------- planted faults
 
 
+def around(
+    patch: pytest.MonkeyPatch, owner: type, name: str, change: Callable[..., object]
+) -> None:
+    """Replace a method; the replacement gets the original method as its first argument."""
+    original = getattr(owner, name)
+    patch.setattr(owner, name, lambda *given, **named: change(original, *given, **named))
+
+
 def applies_what_is_behind(patch: pytest.MonkeyPatch) -> None:
     def gate(self: Sink, header: Any, now_ns: int) -> str:
         self.newest = header.stamp.key
@@ -128,13 +136,11 @@ def goes_back_a_term(role: Stamper) -> None:
 
 
 def moves_within_a_term(patch: pytest.MonkeyPatch) -> None:
-    move = Stamper._move
-
-    def moved(self: Stamper, placement: str, *, by_guard: bool) -> None:
+    def moved(move: Any, self: Stamper, placement: str, *, by_guard: bool) -> None:
         move(self, placement, by_guard=by_guard)
         self.course.term -= by_guard
 
-    patch.setattr(Stamper, "_move", moved)
+    around(patch, Stamper, "_move", moved)
 
 
 def stamps_what_is_no_candidate(patch: pytest.MonkeyPatch) -> None:
@@ -148,28 +154,26 @@ def answers(**changes: Any) -> Patch:
     """Have the stamper answer orders that move the cell with something changed."""
 
     def plant(patch: pytest.MonkeyPatch) -> None:
-        answer = Stamper._answer
-
-        def changed(self: Stamper, order: Order, refused: str, now_ns: int) -> Accepted:
-            said = answer(self, order, refused, now_ns)
+        def changed(
+            answer: Any, self: Stamper, order: Order, refused: str, now_ns: int
+        ) -> Accepted:
+            said: Accepted = answer(self, order, refused, now_ns)
             return replaced(said, **changes) if order.placement and not refused else said
 
-        patch.setattr(Stamper, "_answer", changed)
+        around(patch, Stamper, "_answer", changed)
 
     return plant
 
 
 def takes_orders_of_any_term(patch: pytest.MonkeyPatch) -> None:
-    refusal, send = Stamper._refusal, ControlledCell._send
-
-    def weighed(self: Stamper, order: Order, now_ns: int) -> str:
+    def weighed(refusal: Any, self: Stamper, order: Order, now_ns: int) -> Any:
         return refusal(self, replaced(order, term=self.term) if order.term else order, now_ns)
 
-    def sent(self: ControlledCell, order: Order) -> None:
+    def sent(send: Any, self: ControlledCell, order: Order) -> None:
         send(self, replaced(order, term=order.term - 1) if order.term > 1 else order)
 
-    patch.setattr(Stamper, "_refusal", weighed)
-    patch.setattr(ControlledCell, "_send", sent)
+    around(patch, Stamper, "_refusal", weighed)
+    around(patch, ControlledCell, "_send", sent)
 
 
 def sends_everywhere(patch: pytest.MonkeyPatch) -> None:
@@ -190,13 +194,11 @@ def says_it_ran_elsewhere(patch: pytest.MonkeyPatch) -> None:
 
 
 def says_what_nobody_reads(patch: pytest.MonkeyPatch) -> None:
-    sealed = RolePlace._sealed
-
-    def torn(self: RolePlace, key: str, message: Any) -> bytes:
-        data = sealed(self, key, message)
+    def torn(sealed: Any, self: RolePlace, key: str, message: Any) -> bytes:
+        data: bytes = sealed(self, key, message)
         return data[:-1] if "/done/" in key else data
 
-    patch.setattr(RolePlace, "_sealed", torn)
+    around(patch, RolePlace, "sealed", torn)
 
 
 def trusts_a_book_of_another_boot(patch: pytest.MonkeyPatch) -> None:

@@ -28,7 +28,9 @@ def test_somebody_else_moves_it() -> None:
     policy = Static(candidates=CANDIDATES, initial="LOC")
     policy.decide(observed=SEEN)
     policy.adopt("SO")
-    assert policy._standing == ("SO", "LOC", 0, None)
+    assert policy.incumbent == "SO"
+    decision, _ = policy.propose(observed=SEEN)
+    assert (decision.name, decision.dwell) == ("LOC", 0)
     with pytest.raises(PolicyError, match=r"the adopted placement is 'S0'.*known: LOC, SO"):
         policy.adopt("S0")
 
@@ -39,7 +41,7 @@ def test_what_is_proposed_counts_once_it_is_committed() -> None:
     decision, after = policy.propose(observed=SEEN)
     assert (decision.name, policy.incumbent) == ("LOC", "SO")
     policy.commit(after)
-    assert (policy.incumbent, policy._standing.previous) == ("LOC", "SO")
+    assert policy.incumbent == "LOC"
 
 
 def test_candidates_place_the_same_tasks() -> None:

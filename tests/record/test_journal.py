@@ -270,9 +270,9 @@ def test_many_damaged_places_and_noise_never_crash(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_whole_but_no_journal_is_an_error(tmp_path: Path, content: object) -> None:
-    from dwell.record.journal import _frame
+    from dwell.record.journal import framed
 
-    (tmp_path / JOURNAL).write_bytes(_frame(content))  # type: ignore[arg-type]
+    (tmp_path / JOURNAL).write_bytes(framed(content))  # type: ignore[arg-type]
     with pytest.raises(RunError, match=r"journal\.bin"):
         open_run(tmp_path)
 

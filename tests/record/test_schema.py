@@ -15,7 +15,13 @@ import dwell
 from docs import columns
 from dwell.model import REASONS, Problem, Reason
 from dwell.model.table_columns import TABLES, Column, Feature
-from dwell.record import OUTCOME_SENTENCES, OUTCOMES, REASON_SENTENCES, column_types
+from dwell.record import (
+    OUTCOME_SENTENCES,
+    OUTCOMES,
+    REASON_SENTENCES,
+    column_types,
+    shown_reason,
+)
 from dwell.record.schema import frame_of, polars_schema, row_of
 
 ROOT = Path(__file__).parents[2]
@@ -125,6 +131,11 @@ def test_nan_is_null_only_where_a_column_may_be(problem: Problem) -> None:
 def test_every_outcome_and_reason_has_a_sentence() -> None:
     assert set(OUTCOME_SENTENCES) == set(OUTCOMES)
     assert tuple(REASON_SENTENCES) == REASONS == get_args(Reason)
+
+
+def test_only_infeasible_is_shown_by_its_sentence() -> None:
+    assert shown_reason("hold") == "hold"
+    assert shown_reason("infeasible") == "all candidates are over a cap, this one least"
 
 
 def test_the_page_of_columns_is_the_schema() -> None:

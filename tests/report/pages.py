@@ -12,6 +12,7 @@ from dwell.report.page import Fact
 from dwell.report.page import Page as Shown
 from dwell.report.table import Table
 from dwell.study import Comparison, compare
+from dwell.study.metric import Metric
 from tests.cells.small import make_problem
 
 VOID = {"meta", "br", "img", "link", "use", "input", "hr", "col"}
@@ -91,6 +92,16 @@ def facts_of(page: Shown) -> dict[str, Fact]:
 def table_of(page: Shown, slug: str) -> Table:
     """Return one of a page's tables."""
     return next(table for table in page.tables if table.slug == slug)
+
+
+def silent_on_warmup(page: Shown) -> list[str]:
+    """Return the tables of metrics that do not say whether the warm-up is in."""
+    return [
+        table.slug
+        for table in page.tables
+        if any(isinstance(column, Metric) for column in table.columns)
+        and "the warm-up." not in table.caption
+    ]
 
 
 def figure_of(page: Shown, slug: str) -> Figure:

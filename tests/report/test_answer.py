@@ -31,7 +31,7 @@ def run(canonical: Problem) -> dwell.Run:
 def test_a_summary_has_the_numbers(run: dwell.Run) -> None:
     first = run.windows.filter(~pl.col("warmup"))["first_cycle"][0]
     missed = run.cycles["missed"].to_numpy()[first:].mean()
-    assert f"{100 * missed:.1f} %" in run.summary()
+    assert f"{100 * missed:.2f} %" in run.summary()
 
 
 def test_what_is_shown_is_escaped(canonical: Problem) -> None:

@@ -7,9 +7,9 @@ import math
 import polars as pl
 import pytest
 
+from dwell.display import Measure
 from dwell.report.charts import intervals, is_wide, limit_rule, thinned
 from dwell.report.figure import Figure, svg
-from dwell.report.formatting import Measure
 from dwell.report.palette import Palette
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -11,9 +12,12 @@ import pytest
 
 from dwell.report import comparison_html, comparison_text
 from dwell.report.comparison_page import comparison_page
+from dwell.report.figure import Figure
+from dwell.report.table import Table
 from dwell.study import compare
 from tests.cells.small import SEEDS, make_comparison, make_problem
-from tests.report.pages import Page, small_comparison, table_of
+from tests.dash.browser import chromium, in_browser, opened
+from tests.report.pages import Page, silent_on_warmup, small_comparison, table_of
 
 Shown: TypeAlias = dict[tuple[str, str], Mapping[str, float | Sequence[float]]]
 
@@ -30,15 +34,27 @@ def test_it_is_whole_and_nothing_is_loaded_from_elsewhere(html: str) -> None:
     assert page.outside == []
     assert "script" not in page.tags
     assert len(set(page.ids)) == len(page.ids)
-    assert page.tags.count("svg") == page.tags.count("figure") == len(page.labels)
+    # The topology has two pictures, for large and for small screens.
+    assert page.tags.count("svg") == page.tags.count("figure") + 1 == len(page.labels)
 
 
-def test_the_answer_and_its_figure_come_first() -> None:
-    page = comparison_page(small_comparison())
-    figure, counts = page.sections[0].blocks
-    assert figure is next(page.figures)
-    assert counts is next(page.tables)
-    assert figure.slug == "violation_rate"
+def test_verdict_rates_and_the_cell_are_first_and_the_rest_is_folded() -> None:
+    found = small_comparison()
+    page = comparison_page(found)
+    first, cell, *others = page.sections
+    assert [block.slug for block in first.blocks if isinstance(block, Figure)] == ["violation_rate"]
+    assert first.note.startswith("V_D under 5 %")
+    drawing, placements = cell.blocks
+    assert isinstance(drawing, Figure)
+    assert isinstance(placements, Table)
+    assert [row["placement"] for row in placements.rows] == list(found.problem.candidates)
+    assert not first.folded
+    assert not cell.folded
+    assert all(section.folded for section in others)
+
+
+def test_every_table_says_whether_the_warm_up_is_in() -> None:
+    assert silent_on_warmup(comparison_page(small_comparison())) == []
 
 
 def test_every_policy_stands_in_every_scenario_and_a_reader_can_choose() -> None:
@@ -145,3 +161,20 @@ def test_contenders_are_called_as_in_the_page() -> None:
     assert "+corrected" not in text
     for name in ("DTP (corrected)", "CUSUM (corrected)"):
         assert text.count(f"\n{name} ") == 2
+
+
+@in_browser
+def test_the_page_has_at_most_three_screens_until_a_section_is_opened(tmp_path: Path) -> None:
+    file = tmp_path / "report.html"
+    file.write_text(comparison_html(small_comparison()), encoding="utf-8")
+    drawn = "document.querySelector('.drawing.live')"
+    with (
+        chromium() as browser,
+        opened(browser, file.as_uri(), ready=drawn) as page,
+    ):
+        assert page.evaluate("document.documentElement.scrollHeight") <= 3 * 1000
+        words = page.locator("main").inner_text().split()
+        assert len(words) < 400
+        page.locator("summary").first.focus()
+        page.keyboard.press("Enter")
+        assert page.locator("details[open]").count() == 1

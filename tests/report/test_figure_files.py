@@ -8,9 +8,9 @@ import re
 import polars as pl
 import pytest
 
+from dwell.display import Measure
 from dwell.report.figure import COLUMN_PT
 from dwell.report.figure_files import figure_files, table_tex
-from dwell.report.formatting import Measure
 from dwell.report.run_page import run_page
 from dwell.report.table import Table, Text
 from tests.report.pages import small_run

@@ -20,7 +20,7 @@ from dwell.report.palette import Palette
 from dwell.report.timeline import MOST_BINS, MOST_MARKS
 from dwell.study.fleet_summary import refusals
 from tests.cells.fleets import fleet_of, one_job, within
-from tests.report.pages import Page, facts_of, figure_of, table_of
+from tests.report.pages import Page, facts_of, figure_of, silent_on_warmup, table_of
 
 WORDS = {"stress": (NodeDisturbance("R", at_s=1.0, for_s=1.0, stress_threads=1),)}
 
@@ -57,6 +57,13 @@ def test_cells_stand_with_the_worst_first(run: FleetRun) -> None:
     assert drawn.filter(measure="V_D (%)")["limit"].to_list() == [5.0] * 4
 
 
+def test_a_cell_has_the_numbers_of_other_pages(run: FleetRun) -> None:
+    page = fleet_page(run)
+    assert silent_on_warmup(page) == []
+    rate = table_of(page, "cell-table").rows[0]["violation_rate"]
+    assert facts_of(page)["V_D of the worst cell"].value == f"{100 * rate:.2f} %"
+
+
 def test_stays_of_a_cell_follow_each_other(run: FleetRun) -> None:
     stays = figure_of(fleet_page(run), "time").frames["placed"]
     for name, one in run.cells.items():
@@ -71,7 +78,11 @@ def test_stays_of_a_cell_follow_each_other(run: FleetRun) -> None:
     frames = figure_of(fleet_page(run), "time").frames
     assert frames["moves"].height == run.decisions["migrated"].sum()
     assert frames["nodes"]["used"].to_list() == (run.load["u_E"] * 100).to_list()
-    assert (frames["rates"]["min"] <= frames["rates"]["mean"]).all()
+    rates = frames["rates"]
+    assert (rates["q1"] <= rates["median"]).all()
+    assert (rates["median"] <= rates["q3"]).all()
+    far = rates.filter(pl.col("max") > 2.5 * pl.col("q3") - 1.5 * pl.col("q1"))
+    assert rates["outlier"].drop_nulls().to_list() == far["worst"].to_list()
 
 
 def test_a_long_run_has_fewer_marks(run: FleetRun) -> None:

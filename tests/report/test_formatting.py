@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 
+from dwell.display import Measure, write_number
 from dwell.report.formatting import (
-    Measure,
     few_seeds,
     listed,
     percent,
@@ -15,7 +16,6 @@ from dwell.report.formatting import (
     shown_policy,
     shown_scenario,
     write_interval,
-    write_number,
 )
 from dwell.report.table import Table
 from dwell.study import Interval
@@ -69,7 +69,7 @@ def test_numbers_have_three_digits_that_count(value: float, decimals: int, text:
         (Interval(1.0, 0.861, 1.0), SHARE, "100 [86.1, 100]"),
         (Interval(98.9, 85.0, math.inf), MS, "98.9 [85.0, ∞]"),
         (Interval(math.inf, 85.0, math.inf), MS, "∞ [85.0, ∞]"),
-        (Interval(30.0, 29.0, 31.0), MS._replace(ends=True), "30.0 [29.0, 31.0]"),
+        (Interval(30.0, 29.0, 31.0), replace(MS, ends=True), "30.0 [29.0, 31.0]"),
     ],
 )
 def test_intervals(interval: Interval, measure: Measure, text: str) -> None:

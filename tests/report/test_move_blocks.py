@@ -43,14 +43,10 @@ def blocks(*moves: dict[str, Any]) -> tuple[Figure, Table]:
     return figure, table
 
 
-def domains(figure: Figure) -> list[tuple[float, float]]:
-    """Return the ends of each panel's axes, which are the same up and across."""
-    ends = []
-    for panel in figure.spec()["hconcat"]:
-        encoding = panel["layer"][-1]["encoding"]
-        assert encoding["x"]["scale"] == encoding["y"]["scale"]
-        ends.append(tuple(encoding["x"]["scale"]["domain"]))
-    return ends
+def domains(figure: Figure, axis: str) -> list[tuple[float, float]]:
+    """Return the ends of an axis of each panel."""
+    panels = [panel["layer"][-1]["encoding"] for panel in figure.spec()["hconcat"]]
+    return [tuple(encoding[axis]["scale"]["domain"]) for encoding in panels]
 
 
 def rules(panel: dict[str, Any]) -> list[float]:
@@ -64,20 +60,30 @@ def test_without_moves_nothing_is_shown() -> None:
     assert move_blocks(frame(), PALETTE, 33.0) == []
 
 
-def test_the_diagonal_and_both_axes_reach_from_end_to_end() -> None:
+def test_each_axis_has_the_range_of_its_values() -> None:
     figure, _ = blocks({}, {"to": "HYB"})
-    (low_ms, high_ms), (low, high) = domains(figure)
-    assert low_ms < 28.5
-    assert high_ms > 38.0
-    assert 0.0 <= low < 2.0
-    assert high > 9.0
-    for panel, ends in zip(figure.spec()["hconcat"], domains(figure), strict=True):
-        diagonal = panel["layer"][0]
-        assert [row["at"] for row in diagonal["data"]["values"]] == list(ends)
+    for when, axis in (("seen", "x"), ("predicted", "y")):
+        (low_ms, high_ms), (low, high) = domains(figure, axis)
+        value, error = MOVE[f"{when}_l95_ms"], MOVE[f"{when}_l95_error_ms"]
+        assert isinstance(value, float)
+        assert isinstance(error, float)
+        assert low_ms <= value - error < value + error < high_ms
+        assert high_ms - low_ms < 2.3 * error
+        share = MOVE[f"{when}_violation_rate"]
+        assert isinstance(share, float)
+        assert low <= 100 * share < high
 
 
-def test_the_deadline_is_shown_where_the_axes_reach_it() -> None:
-    near, _ = blocks({})
+def test_the_line_of_equality_has_the_part_that_both_ranges_have() -> None:
+    figure, _ = blocks({}, {"predicted_l95_ms": 36.0, "seen_l95_ms": 30.0})
+    panel = figure.spec()["hconcat"][0]
+    ends = [row["at"] for row in panel["layer"][0]["data"]["values"]]
+    ranges = [domains(figure, axis)[0] for axis in ("x", "y")]
+    assert ends == [max(low for low, _ in ranges), min(high for _, high in ranges)]
+
+
+def test_the_deadline_is_shown_where_an_axis_reaches_it() -> None:
+    near, _ = blocks({"predicted_l95_ms": 33.0, "seen_l95_ms": 33.0})
     latency, rate = near.spec()["hconcat"]
     assert rules(latency) == [33.0, 33.0]
     assert rules(rate) == []
@@ -104,7 +110,7 @@ def test_candidates_have_their_colours_and_only_those_moved_to() -> None:
 )
 def test_it_is_drawn_whatever_is_known(move: dict[str, Any]) -> None:
     figure, _ = blocks(move)
-    assert all(low < high for low, high in domains(figure))
+    assert all(low < high for low, high in domains(figure, "x"))
     assert svg(figure).count("<svg") == 1
     assert 'width="25' in printed_svg(figure)
 
@@ -113,7 +119,7 @@ def test_the_table_has_errors_where_they_are_known() -> None:
     _, table = blocks({}, UNSEEN)
     ((_, (seen, unseen)),) = table.groups()
     texts = [f"{cell.text} {cell.error}".strip() for cell in seen]
-    assert texts == ["9", "LOC", "SO", "30.0 ± 1.5", "36.0 ± 2.0", "2.0", "8.0 ± 1.0", "4"]
+    assert texts == ["9", "LOC", "SO", "30.0 ± 1.5", "36.0 ± 2.0", "2.00", "8.00 ± 1.00", "4"]
     assert [unseen[place].text for place in (4, 6, 7)] == ["–", "–", "0"]
 
 

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
+import dwell.dash
 from dwell.display import HUES
+from dwell.policies import registry
 from dwell.report.page import TEMPLATES
 from dwell.report.palette import (
     APART,
@@ -20,6 +23,7 @@ from dwell.report.palette import (
     Palette,
 )
 
+DASH = Path(dwell.dash.__file__).parent / "static"
 CANDIDATES = ("LOC", "SO", "HYB")
 NAMES = (*CANDIDATES, "atp", "dtp", "latency-first", "dtp+corrected", "cusum+corrected")
 
@@ -74,6 +78,37 @@ def test_several_dtps_differ_by_colour_marker_and_dashes(names: tuple[str, ...])
     for looks in ("colour", "marker", "dashes"):
         assert len({getattr(style, looks) for style in shown}) == len(names)
     assert not {style.colour for style in shown} & set(HUES)
+
+
+def luminance(colour: str) -> float:
+    """Return the relative luminance of WCAG 2.2."""
+    shares = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
+    linear = [s / 12.92 if s <= 0.04045 else ((s + 0.055) / 1.055) ** 2.4 for s in shares]
+    return sum(w * s for w, s in zip((0.2126, 0.7152, 0.0722), linear, strict=True))
+
+
+def contrast(one: str, other: str) -> float:
+    low, high = sorted((luminance(one), luminance(other)))
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("folder", [TEMPLATES, DASH])
+def test_every_mark_has_a_contrast_of_three_with_the_paper(folder: Path) -> None:
+    css = (folder / "page.css").read_text(encoding="utf-8").replace("#fff;", "#ffffff;")
+    pages = re.findall(r":root \{\s*([^}]*)\}", css)
+    assert len(pages) == 2
+    policies = {one.colour for one in registry.FAMILIES.values() if one.colour.startswith("#")}
+    # Parts of bars have an outline; rules, bands and shades are no marks.
+    unmarked = {"paper", "rule", "shade", "band", "compute", "queue", "network"}
+    for page in pages:
+        values = dict(re.findall(r"--([\w-]+): (#\w{6})", page))
+        drawn = {*HUES, *policies, *(one for name, one in values.items() if name not in unmarked)}
+        assert {one for one in drawn if contrast(one, values["paper"]) < 3} == set()
+
+
+def test_lists_of_runs_have_the_hues_of_placements() -> None:
+    css = (DASH / "page.css").read_text(encoding="utf-8")
+    assert tuple(re.findall(r"--hue-\d: (#\w{6})", css))[: len(HUES)] == HUES
 
 
 def test_every_colour_of_a_drawing_has_a_value_on_paper_and_in_the_page() -> None:

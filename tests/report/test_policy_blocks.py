@@ -12,9 +12,9 @@ import pytest
 import dwell
 from dwell.report import comparison_text
 from dwell.report.comparison_page import comparison_page
-from dwell.report.formatting import RATE
 from dwell.report.policy_blocks import PolicyBlocks, scaled
 from dwell.study import compare, over_seeds
+from dwell.study.metric import METRICS
 from tests.cells.examples import EXAMPLES
 from tests.cells.small import SEEDS, make_comparison
 from tests.report.pages import small_comparison
@@ -138,7 +138,9 @@ def test_on_a_terminal_there_is_no_room_for_all_intervals() -> None:
 
 def test_numbers_are_shown_in_the_unit_of_their_measure() -> None:
     runs = make_comparison({("baseline", "LOC"): rates(0.02)}, policies=("LOC",)).runs
-    table = scaled(over_seeds(runs, ("scenario", "policy"), ["violation_rate"]), RATE)
+    table = scaled(
+        over_seeds(runs, ("scenario", "policy"), ["violation_rate"]), METRICS["violation_rate"]
+    )
     row = table.row(0, named=True)
     assert row["mean"] == pytest.approx(2.0)
     assert row["low"] == pytest.approx(100 * row["violation_rate_low"])

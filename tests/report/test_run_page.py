@@ -17,7 +17,14 @@ from dwell.report.run_page import run_page
 from dwell.study.predicted_moves import predicted_moves
 from tests.cells.many import many
 from tests.cells.small import make_problem
-from tests.report.pages import Page, facts_of, figure_of, small_run, table_of
+from tests.report.pages import (
+    Page,
+    facts_of,
+    figure_of,
+    silent_on_warmup,
+    small_run,
+    table_of,
+)
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +47,18 @@ def test_the_answer_and_its_figure_come_first() -> None:
     assert isinstance(rate, float)
     name, fact = next(iter(facts_of(page).items()))
     assert name.startswith("V_D")
-    assert float(fact.value.removesuffix(" %")) == pytest.approx(100 * rate, abs=0.05)
+    assert fact.value == f"{100 * rate:.2f} %"
     assert page.sections[0].blocks[0] is next(page.figures)
+
+
+def test_every_table_says_whether_the_warm_up_is_in() -> None:
+    assert silent_on_warmup(run_page(small_run())) == []
+
+
+def test_a_symbol_has_its_index_in_text_and_figures(html: str) -> None:
+    assert "V<sub>D</sub>" in html
+    assert 'V<tspan dy=".3em" font-size="75%">D</tspan>' in html
+    assert "V_D" not in Page(html).text
 
 
 def test_migrations_are_those_after_the_warm_up() -> None:
@@ -130,7 +147,7 @@ def test_a_run_that_lost_everything_has_a_page() -> None:
     scenarios = {"dead": (NodeDisturbance("R2", down=True),)}
     run = simulate(replace(make_problem(), scenarios=scenarios), scenario="dead", seed=1, windows=6)
     text = Page(run_html(run, static=True)).text
-    assert "100 %" in text
+    assert "100.00 %" in text
     assert "∞" in text
 
 
@@ -178,4 +195,4 @@ def test_phases_have_the_placements_that_some_phase_was_on() -> None:
     problem = replace(many_cell, scenarios={"stress": stressed})
     page = run_page(simulate(problem, scenario="stress", policy="R-R-R", seed=1, windows=8))
     columns = [one.column for one in table_of(page, "phases").columns]
-    assert [one for one in columns if one.startswith("share")] == ["share R-R-R"]
+    assert [one for one in columns if one.startswith("share")] == ["share_R-R-R"]

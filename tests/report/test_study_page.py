@@ -21,7 +21,7 @@ from dwell.report.page import Definitions
 from dwell.report.study_page import study_page
 from dwell.study import Contender, Point, Study, open_study, run_study
 from tests.cells.small import make_problem
-from tests.report.pages import Page, figure_of, table_of
+from tests.report.pages import Page, figure_of, silent_on_warmup, table_of
 
 DWELL, LATE = "controller.min_dwell", "controller.min_improvement"
 
@@ -104,7 +104,7 @@ def test_parameters_that_go_together_are_one_axis_with_its_label(tmp_path: Path)
     assert [section.title for section in page.sections[:3]] == [
         "By P (ms)",
         "More by P (ms)",
-        "Every point",
+        "The cell and its placements",
     ]
     assert Definitions({"together with it": DWELL}) in page.sections[0].blocks
     assert figure_of(page, "cost-0").frames["rows"]["at"].unique().sort().to_list() == [40, 50]
@@ -119,11 +119,15 @@ def test_panels_of_two_parameters_are_told_apart(folder: Path) -> None:
         assert heading in drawn
 
 
+def test_every_table_says_whether_the_warm_up_is_in(folder: Path) -> None:
+    assert silent_on_warmup(study_page(open_study(folder))) == []
+
+
 def test_the_page_is_whole(folder: Path) -> None:
     page = Page(study_html(open_study(folder), static=True))
     assert page.outside == []
     assert len(page.ids) == len(set(page.ids))
-    assert "How it was made" in page.headings
+    assert "Method" in page.headings
 
 
 def test_a_study_of_one_point_is_shown_by_policy(tmp_path: Path) -> None:
@@ -180,6 +184,6 @@ def test_a_page_shows_the_references(tmp_path: Path) -> None:
         )
         for name in names
     }
-    method = next(one for one in page.sections if one.title == "How it was made")
+    method = next(one for one in page.sections if one.title == "Method")
     defined = [one.entries for one in method.blocks if isinstance(one, Definitions)]
     assert any("Oracle" in entries for entries in defined)

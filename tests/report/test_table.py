@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from dwell.report.formatting import Measure
+from dwell.display import Measure
 from dwell.report.palette import MUTED, Palette
 from dwell.report.table import Cell, Columns, Table, Text, interval_row, table_text
 from dwell.study import Interval
@@ -106,3 +106,16 @@ def test_text_has_title_groups_and_caption_and_folds() -> None:
 def test_a_table_without_rows_is_a_heading_and_nothing() -> None:
     assert list(Table("t", "", COLUMNS, []).groups()) == []
     assert table_text(Table("t", "Nothing", COLUMNS, [])).split() == ["Nothing"]
+
+
+def test_a_wide_table_has_parts_that_begin_with_its_first_column() -> None:
+    columns: Columns = [Text("policy", "policy"), *(Measure(f"m{i}", f"m{i}") for i in range(7))]
+    rows = [{"policy": "LOC", **{f"m{i}": float(i) for i in range(7)}}]
+    parts = Table("wide", "Title", columns, rows, caption="Caption.").parts(3)
+    assert [[column.name for column in part.columns] for part in parts] == [
+        ["policy", "m0", "m1", "m2"],
+        ["policy", "m3", "m4", "m5"],
+        ["policy", "m6"],
+    ]
+    assert [part.slug for part in parts] == ["wide", "wide-2", "wide-3"]
+    assert [part.title for part in parts] == ["Title", "", ""]

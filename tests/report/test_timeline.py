@@ -57,6 +57,14 @@ def test_every_window_has_a_mark_with_what_it_showed(run: dwell.Run) -> None:
     assert frames["moves"].height == moved
 
 
+def test_a_printed_figure_has_no_links(run: dwell.Run) -> None:
+    figure = timeline(run, links={0: "#window-0"})
+    assert '"#window-0"' in svg(figure)
+    printed = printed_svg(figure)
+    assert "#window-0" not in printed
+    assert "vega.github.io" not in printed
+
+
 def test_resources_are_those_that_windows_tell_of() -> None:
     problem = dwell.load(EXAMPLES / "fan-in.yaml")
     windows = dwell.simulate(problem, policy="EDGE", seed=1, windows=2).windows

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import dwell
-from dwell.report.figure import svg
-from dwell.report.topology import topology
+from dwell.report.figure import Figure, svg
+from dwell.report.topology import WIDTHS, topology
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -33,6 +33,61 @@ def test_every_node_has_its_tasks_and_every_pair_one_line(name: str) -> None:
     assert frames["links"].height == len(pairs)
     picture = svg(topology(problem))
     assert all(f">{node}: " in picture for node in lines)
+
+
+def boxes(figure: Figure, width: float) -> dict[str, tuple[float, float]]:
+    """Return the middle of the first line of each node."""
+    heads = figure.spec(width)["layer"][4]["data"]["values"]
+    return {row["text"].partition(":")[0]: (row["x"], row["y"]) for row in heads}
+
+
+def many(robots: int) -> dwell.model.Problem:
+    """Return the canonical cell with further robots, whose names are long."""
+    problem = dwell.load(EXAMPLES / "canonical.yaml")
+    fabric = problem.fabric
+    more = {
+        name: replace(fabric.nodes["R1"], name=name)
+        for name in (f"robot-with-a-name-of-forty-letters-計算機{i:02}" for i in range(robots))
+    }
+    links = {
+        link.name: link for name in more for link in (replace(fabric.links["R1->E"], source=name),)
+    }
+    return replace(
+        problem,
+        fabric=replace(fabric, nodes={**fabric.nodes, **more}, links={**fabric.links, **links}),
+        objective=replace(
+            problem.objective, tiers={**problem.objective.tiers, **dict.fromkeys(more, "robot")}
+        ),
+    )
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", ["canonical", "fan-in"])
+def test_robots_are_below_the_edge_in_the_order_of_the_cell(name: str, width: float) -> None:
+    places = boxes(topology(dwell.load(EXAMPLES / f"{name}.yaml")), width)
+    assert places["R1"][0] < places["R2"][0]
+    assert places["R1"][1] == places["R2"][1] > places["E"][1]
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+def test_thirty_nodes_do_not_overlap(width: float) -> None:
+    figure = topology(many(27))
+    places = list(boxes(figure, width).values())
+    assert len(places) == 30
+    for i, (x, y) in enumerate(places):
+        assert 0 <= x <= width
+        for other_x, other_y in places[:i]:
+            assert abs(x - other_x) >= 150 or abs(y - other_y) >= 40
+    svg(figure, width)
+
+
+def test_links_that_are_alike_are_in_the_caption() -> None:
+    alike = topology(dwell.load(EXAMPLES / "canonical.yaml"))
+    assert "Each link: 0.70 ms, 940 Mbit/s." in alike.caption
+    assert "Mbit/s" not in svg(alike)
+    cloud = topology(dwell.load(EXAMPLES / "cloud.yaml"))
+    assert "Each link" not in cloud.caption
+    assert all(text in svg(cloud) for text in cloud.frames["links"]["text"])
 
 
 def test_a_cell_of_one_node_has_no_lines() -> None:

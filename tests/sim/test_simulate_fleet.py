@@ -217,6 +217,15 @@ def test_seeds_of_a_fleet_share_one_table_of_loads(canonical: Problem, phases: s
     assert [found == {windows} for found in totals] == [False, True, True]
 
 
+def test_a_ledger_of_cells_that_never_move_makes_no_table_of_loads(canonical: Problem) -> None:
+    cell = replace(canonical, name="fixed")
+    fleet = hall(cell, 3, policy="SO", coordination="ledger")
+    told: list[tuple[int, int]] = []
+    run = simulate_fleet(fleet, windows=6, progress=partial(_append, told))
+    assert {total for _, total in told} == {6 * len(fleet.cells)}
+    assert run.decisions["round"].null_count() == 0
+
+
 def test_when_the_edge_is_back_nobody_tramples_it(canonical: Problem) -> None:
     problem = crowded(canonical, NodeDisturbance(node="E", at_s=60.0, for_s=8.0, down=True))
     # No guard moves a cell onto the edge because its robot is slow.

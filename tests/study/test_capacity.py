@@ -205,7 +205,7 @@ def test_no_smaller_size_may_be_over_the_limit(monkeypatch: pytest.MonkeyPatch) 
     assert found(0.06, 0.11, 0.12).robots == 2
     assert found(0.04, 0.09, 0.12, on_excess=True).robots == 2
     useless = found(0.6, 0.6)
-    assert (useless.robots, useless.reason) == (0, "one cell alone misses 60% of its deadlines")
+    assert (useless.robots, useless.reason) == (0, "one cell alone misses 60.00 % of its deadlines")
 
 
 @pytest.mark.parametrize(

@@ -64,7 +64,7 @@ def test_over_several_nodes_it_is_close_to_the_least(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_both_ways_find_the_same(seed: int) -> None:
     loads, alone = random_loads(seed, ["E"])
-    program = fleet_plan._by_program(loads, alone)
+    program = fleet_plan.by_program(loads, alone)
     known = sum(loads.costs(best_placements(loads, alone), alone))
     assert sum(loads.costs(program, alone)) == pytest.approx(known, rel=0.01)
 

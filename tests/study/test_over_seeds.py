@@ -11,7 +11,7 @@ from dwell.study.intervals import mean_interval
 from dwell.study.over_seeds import interval_of, over_seeds, windows_behind
 
 
-@pytest.mark.parametrize("column", ["migrations", "l95_ms", "cost", "u_edge", "u_R1"])
+@pytest.mark.parametrize("column", ["migrations", "l95_ms", "cost", "u_edge", "returns"])
 def test_what_cannot_be_below_nothing_has_no_limit_there(column: str) -> None:
     values = np.array([0.0, 0.0, 1.0])
     mean, low, high = mean_interval(values)

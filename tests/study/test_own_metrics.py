@@ -182,7 +182,7 @@ def test_a_metric_that_fails_is_named_with_its_run(
 
 
 @pytest.mark.parametrize(
-    "name", ["cost", "violation_rate", "share_of_luck", "tracking_x", "seed", "regret", "lost"]
+    "name", ["cost", "violation_rate", "share_of_luck", "tracking_rms_mm", "seed", "regret", "lost"]
 )
 def test_a_name_that_a_column_has_is_refused(study: Path, name: str) -> None:
     with pytest.raises(SimulationError, match=f"metrics.{name}: the tables have such a column"):

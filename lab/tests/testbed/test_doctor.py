@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 import dwell
-from dwell.cli.findings import Finding
+from dwell.cli.findings import Check, Finding
 from dwell.errors import LiveError
 from dwell.live.local.cgroups import find_cgroups
 from dwell.model import Problem, Quota
 from dwell_lab.testbed import doctor
-from dwell_lab.testbed.doctor import examine
+from dwell_lab.testbed.doctor import checks_for, examine
 from dwell_lab.testbed.probe import Lateness
 from lab.tests.testbed.machine import no_groups, no_hosts
 from tests.cells.once import with_windows
@@ -53,8 +53,10 @@ def with_quotas(*quotas: Quota) -> Problem:
     return replace(problem, fabric=replace(problem.fabric, nodes=nodes))
 
 
-def cores(findings: list[Finding]) -> Finding:
-    return next(one for one in findings if one.name == "CPUs")
+def finding_of(name: str, problems: list[Problem], watch_s: float = 0.0) -> Finding:
+    """Run a single check."""
+    checks = checks_for(problems, watch_s=watch_s)
+    return next(one for one in checks if one.name == name).finding()
 
 
 @pytest.mark.skipif(bool(no_hosts() or no_groups()), reason=no_hosts() or no_groups())
@@ -81,7 +83,7 @@ def test_all_findings_say_what_was_found(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_quotas_that_fit_are_told_where_they_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    finding = doctor._cores([with_quotas(Quota(0.4, 4), Quota(0.4, 4), Quota(0.8, 4))])
+    finding = finding_of("CPUs", [with_quotas(Quota(0.4, 4), Quota(0.4, 4), Quota(0.8, 4))])
     assert finding.ok
     assert " on 1" in finding.found
 
@@ -98,7 +100,7 @@ def test_quotas_that_do_not_fit_are_refused(
     monkeypatch: pytest.MonkeyPatch, quotas: tuple[Quota, ...], said: str
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    finding = doctor._cores([with_quotas(*quotas)])
+    finding = finding_of("CPUs", [with_quotas(*quotas)])
     assert not finding.ok
     assert finding.needed
     assert said in finding.found
@@ -107,14 +109,14 @@ def test_quotas_that_do_not_fit_are_refused(
 
 def test_a_machine_with_one_cpu_has_little_to_give(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0})
-    assert "0.6 for nodes" in doctor._cores([]).found
+    assert "0.6 for nodes" in finding_of("CPUs", []).found
 
 
-def test_what_goes_wrong_in_a_trial_is_a_finding() -> None:
-    def fail() -> str:
+def test_what_goes_wrong_in_a_check_is_a_finding() -> None:
+    def fail() -> tuple[bool, str]:
         raise LiveError("it is not there")
 
-    assert doctor._attempt("it", fail, "get it") == Finding(
+    assert Check("it", fail, "get it").finding() == Finding(
         "it", False, "it is not there", "get it"
     )
 
@@ -139,7 +141,7 @@ class Standing:
 
 def test_a_machine_that_stands_still_at_times_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "Probe", Standing)
-    finding = doctor._standstill([], 2.5)
+    finding = finding_of("no standstills", [], 2.5)
     assert not finding.ok
     assert not finding.needed
     assert "longest was 30.0 ms" in finding.found
@@ -147,7 +149,7 @@ def test_a_machine_that_stands_still_at_times_is_told_so(monkeypatch: pytest.Mon
     assert finding.remedy
     # Windows that are so short that most of them had none, but not enough.
     short = with_windows(with_quotas(), 1)
-    finding = doctor._standstill([short], 2.5)
+    finding = finding_of("no standstills", [short], 2.5)
     share = int(re.findall(r"(\d+)% of the windows", finding.found)[0])
     assert 5 < share < 60
     assert not finding.ok

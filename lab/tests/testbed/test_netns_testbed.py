@@ -15,7 +15,7 @@ from dwell.errors import LiveError
 from dwell.live.local.processes import expected
 from dwell.live.local.timeline import Change, NodeState, usual_conditions
 from dwell.model import Constant
-from dwell_lab.testbed.hosts import namespace_path
+from dwell_lab.testbed.hosts import namespace_name, namespace_path
 from dwell_lab.testbed.netns_testbed import NetnsTestbed
 from lab.tests.testbed.machine import no_groups, no_hosts, own_name
 from tests.cells.light import document, write_cell
@@ -107,9 +107,9 @@ def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
     watcher = testbed.watcher
     if "controller@E" not in testbed.processes.running:
         testbed.begin()
-    there = set(testbed._groups.pids("R2"))
+    there = set(testbed.switches["R2"]())
     testbed.apply(Change(0, "R2", NodeState(0, down=True)))
-    assert testbed._groups.pids("R2") == []
+    assert not testbed.switches["R2"]()
     testbed.apply(Change(1, "R2", NodeState(0)))
 
     def ready() -> bool:
@@ -118,12 +118,12 @@ def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
         return all(who in heard and heard[who]["age_ms"] < 1_000 for who in names)
 
     wait_for(ready, "the processes of R2")
-    assert not there & set(testbed._groups.pids("R2"))
+    assert not there & set(testbed.switches["R2"]())
 
 
 def test_nothing_is_left(testbed: NetnsTestbed) -> None:
     """The last: it takes the testbed down."""
-    namespaces = [namespace_path(testbed._hosts.namespace(node)) for node in testbed.nodes]
+    namespaces = [namespace_path(namespace_name(testbed.name, node)) for node in testbed.nodes]
     assert all(path.exists() for path in namespaces)
     testbed.stop()
     assert not any(path.exists() for path in namespaces)

@@ -78,19 +78,19 @@ class MachineCounters:
 
 def processor() -> str:
     """Return the name of the processor, or its architecture if Linux gives no name."""
-    match = re.search(r"^(?:model name|Model)\s*:\s*(.+)$", _text("/proc/cpuinfo"), re.MULTILINE)
+    match = re.search(r"^(?:model name|Model)\s*:\s*(.+)$", text_of("/proc/cpuinfo"), re.MULTILINE)
     return match[1].strip() if match else platform.machine()
 
 
 def _of_cpu(core: int, name: str) -> str:
-    return _text(f"/sys/devices/system/cpu/cpu{core}/cpufreq/{name}").strip()
+    return text_of(f"/sys/devices/system/cpu/cpu{core}/cpufreq/{name}").strip()
 
 
 def _frequency_mhz(core: int) -> float | None:
     kilohertz = _of_cpu(core, "scaling_cur_freq")
     if kilohertz.isdigit():
         return int(kilohertz) / 1e3
-    for block in _text("/proc/cpuinfo").split("\n\n"):
+    for block in text_of("/proc/cpuinfo").split("\n\n"):
         if re.search(rf"^processor\s*:\s*{core}$", block, re.MULTILINE):
             match = re.search(r"^cpu MHz\s*:\s*([\d.]+)$", block, re.MULTILINE)
             return float(match[1]) if match else None
@@ -101,7 +101,7 @@ def _ticks(cores: Collection[int]) -> tuple[int, int] | None:
     """Return stolen and all clock ticks of `cores` since the machine started."""
     stolen = total = 0
     for core in cores:
-        match = re.search(rf"^cpu{core} ([\d ]+)$", _text("/proc/stat"), re.MULTILINE)
+        match = re.search(rf"^cpu{core} ([\d ]+)$", text_of("/proc/stat"), re.MULTILINE)
         # user nice system idle iowait irq softirq steal; guests are in user and nice already
         ticks = [] if match is None else [int(word) for word in match[1].split()[:8]]
         if len(ticks) < 8:
@@ -111,7 +111,8 @@ def _ticks(cores: Collection[int]) -> tuple[int, int] | None:
     return stolen, total
 
 
-def _text(path: str) -> str:
+def text_of(path: str) -> str:
+    """Return the content of a file of the kernel; empty if it does not exist."""
     try:
         return Path(path).read_text(encoding="utf-8", errors="replace")
     except OSError:

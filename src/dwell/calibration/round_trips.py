@@ -206,7 +206,7 @@ def time_round_trips(
     Parameters
     ----------
     payload_bytes : int
-        Payload of the larger message; random bytes, so that nothing on the way compresses them.
+        Payload of the larger message; its bytes are random, against compression on the way.
     settings : Settings
         Rounds, rounds of warm-up, and the time between two.
     connect_s, answer_s : float
@@ -217,7 +217,7 @@ def time_round_trips(
     ProblemError
         If a number is out of its range.
     MeasurementError
-        If there is no such peer, it is something else, does not answer in time, or goes away.
+        If the peer is missing, is not a `listen`, answers too late, or closes the connection.
     """
     PAYLOAD_BYTES.check("bytes", payload_bytes)
     if settings.period_ms is not None:
@@ -345,7 +345,7 @@ def rate_mbps(payload_bytes: int, longer_ms: float) -> float | None:
     Returns
     -------
     float or None
-        None if the extra time is not positive, or a cell does not allow the rate.
+        None if the extra time is 0 or less, or the rate is out of the range of a cell.
     """
     if longer_ms <= 0:
         return None

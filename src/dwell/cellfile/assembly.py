@@ -109,10 +109,7 @@ class Assembly:
         controller = self._section("controller", ControllerSettings)
         servo = self._servo()
         live = self._section("live", LiveSettings)
-        scenarios = {
-            name: list(self._disturbances(items or ()))
-            for name, items in (entry.scenarios or {}).items()
-        }
+        scenarios = self._scenarios()
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
         called = name if entry.name is None else entry.name
         parts = CellParts(
@@ -136,12 +133,9 @@ class Assembly:
         self._judge(parts)
         if self.faults or timing is None or objective is None or controller is None or live is None:
             return None
-        whole = {name: task for name, task in tasks.items() if task is not None}
+        whole = _without_none(tasks)
         fabric = self.faults.attempt(
-            "",
-            Fabric,
-            nodes={name: node for name, node in nodes.items() if node is not None},
-            links={link.name: link for _, link in links},
+            *("", Fabric), nodes=_without_none(nodes), links={link.name: link for _, link in links}
         )
         pipeline = self.faults.attempt(
             "", replace, timing, tasks=whole, flows=tuple(flow for _, flow in flows)
@@ -244,6 +238,10 @@ class Assembly:
         return self._make(entry, Pipeline, **{**given, "tasks": {}, "flows": (), "scales": scales})
 
     # --------------------------------------------------- scenarios, objective, controller
+
+    def _scenarios(self) -> dict[str, list[tuple[str, Disturbance]]]:
+        scenarios = self.entry.scenarios or {}
+        return {name: list(self._disturbances(items or ())) for name, items in scenarios.items()}
 
     def _disturbances(self, entries: Sequence[Entry | None]) -> Iterator[tuple[str, Disturbance]]:
         for entry in entries:
@@ -363,6 +361,11 @@ def unregistered(parts: CellParts, name: str) -> list[Fault]:
     """Return the faults in names: of policies, estimators, columns and the cell."""
     known = policies.names(), estimators.names(), estimators.shadowing()
     return list(find_unregistered(parts, name, *known))
+
+
+def _without_none(parts: Mapping[str, T | None]) -> dict[str, T]:
+    """Return the parts without faults."""
+    return {name: part for name, part in parts.items() if part is not None}
 
 
 def _forward(

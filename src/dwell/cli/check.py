@@ -169,6 +169,8 @@ def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
 
 
 def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> str:
+    from dwell.study.metric import METRICS
+
     pipeline, nodes = problem.pipeline, problem.fabric.nodes
     resources = problem.fabric.resources
     movable = [
@@ -177,12 +179,13 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
         if not task.anchored
     ]
     what = "node" if len(resources) == len(nodes) else "node and accelerator"
-    head = ["candidate", "L95 (ms)", "V_D (%)", *(f"{one} (%)" for one in resources)]
+    l95, rate = METRICS["l95_ms"], METRICS["violation_rate"]
+    head = ["candidate", l95.heading, rate.heading, *(f"{one} (%)" for one in resources)]
     rows = [
         [
             name,
             _with_error(milliseconds(price.l95_ms), price.l95_error_ms),
-            _with_error(f"{price.violation_rate * 100:.1f}", price.violation_error * 100),
+            _with_error(rate.number(price.violation_rate), price.violation_error * 100),
             *(f"{price.own[one] * 100:.0f}" for one in resources),
         ]
         for name, price in prices.items()
@@ -232,7 +235,7 @@ def _shadow_notes(
         if fraction == most:
             continue
         too_dear = tried[name][0 if fraction else -1]
-        more = f"miss {too_dear.violation_rate * 100:.1f} points more"
+        more = f"miss {too_dear.violation_rate * 100:.2f} points more"
         if problem.objective.weights.violations * too_dear.violation_rate < too_dear.cost / 2:
             more = f"have an L95 {milliseconds(too_dear.l95_ms)} ms longer"
         alone = "" if fraction else f"; under {name} the estimator learns from the incumbent alone"

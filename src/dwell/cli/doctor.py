@@ -44,7 +44,7 @@ def consult(problem: Problem | None, *, keys: Path | None, as_json: bool) -> boo
     Returns
     -------
     bool
-        Whether nothing is broken; what is merely not installed is not.
+        Whether all needed things are well.
     """
     extras = [_extra(name) for name in EXTRAS]
     kernel = _kernel()
@@ -126,7 +126,7 @@ def _kernel() -> Finding:
 
 
 def _runs(extras: Sequence[Finding], kernel: Finding, others: Sequence[Part]) -> Iterator[Finding]:
-    """Yield the commands: those that work here, and the missing parts of the others."""
+    """Yield a finding per group of commands: whether it works here, else the missing parts."""
     named = {extra.name: replace(extra, name=f"the extra {extra.name}") for extra in extras}
     needs = {
         **{EXTRAS[name]: [extra] for name, extra in named.items()},

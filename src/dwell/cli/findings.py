@@ -5,24 +5,26 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import typer
 
+from dwell.errors import DwellError
+
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Result of looking at one thing.
+    """Result of one check.
 
     Parameters
     ----------
     name : str
-        The thing, in a few words.
+        Name of the thing, in a few words.
     remedy : str
-        Empty if there is nothing to do.
+        Action that repairs it; empty if no action is needed.
     needed : bool
-        Whether the part cannot work without.
+        Whether its part needs it to work.
     """
 
     name: str
@@ -30,6 +32,28 @@ class Finding:
     found: str
     remedy: str = ""
     needed: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing to look for on this computer, with the remedy if it is missing.
+
+    `look` returns whether all is well, with a description. If it raises a DwellError, the thing is
+    missing.
+    """
+
+    name: str
+    look: Callable[[], tuple[bool, str]]
+    remedy: str = ""
+    needed: bool = True
+
+    def finding(self) -> Finding:
+        """Look."""
+        try:
+            ok, found = self.look()
+        except DwellError as error:
+            ok, found = False, str(error)
+        return Finding(self.name, ok, found, "" if ok else self.remedy, self.needed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +86,7 @@ def print_findings(findings: Iterable[Finding], *, broken: str, lacking: str) ->
     Parameters
     ----------
     broken, lacking : str
-        Marks of what is needed and not well, and of what is not well and not needed.
+        Marks of failed findings: on needed parts, and on optional parts.
     """
     columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     for finding in findings:

@@ -26,7 +26,6 @@ from dwell.cli.output import (
     write_report,
 )
 from dwell.cli.run import default_folder
-from dwell.display import milliseconds
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from dwell.study.capacity import Capacity
     from dwell.study.fleet_plan import FleetPlan
     from dwell.study.intervals import Interval
+    from dwell.study.metric import Metric
     from dwell.study.what_ifs import WhatIf
 
 #: Cells, and rounds, that the terminal shows, and columns that time has there.
@@ -291,14 +291,17 @@ def _asked_text(asked: int, found: Capacity, served: tuple[str, int] | None) -> 
 
 
 def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
+    from dwell.study.metric import METRICS
+
+    rate, l95 = METRICS["violation_rate"], METRICS["l95_ms"]
     counts = Counter(found.placements.values())
     placed = ", ".join(f"{count} on {name}" for name, count in counts.most_common())
     rows = [
         [
             name,
             found.placements[name],
-            f"{qos.violation_rate * 100:.2f}",
-            milliseconds(qos.l95_ms, 2),
+            rate.number(qos.violation_rate),
+            l95.number(qos.l95_ms),
         ]
         for name, qos in sorted(
             found.cells.items(), key=lambda one: one[1].violation_rate, reverse=True
@@ -309,7 +312,7 @@ def _plan_text(of: Fleet, found: FleetPlan, seed: int) -> str:
         f"best: {placed}",
         f"Φ/n   {found.phi:.3f} as played, {found.table_phi:.3f} by the table of loads",
         "",
-        aligned(["cell, the worst first", "placement", "V_D (%)", "L95 (ms)"], rows[:SHOWN]),
+        aligned(["cell, the worst first", "placement", rate.heading, l95.heading], rows[:SHOWN]),
     ]
     if len(rows) > SHOWN:
         lines.append(f"{len(rows) - SHOWN} more, with fewer misses, are in --json")
@@ -355,6 +358,8 @@ def _head(result: FleetRun) -> dict[str, Any]:
 
 
 def _text(result: FleetRun, summary: Mapping[str, Any]) -> str:
+    from dwell.study.metric import METRICS
+
     fleet = result.fleet
     shared = ", ".join(fleet.shared) or "nothing"
     lines = [
@@ -365,7 +370,7 @@ def _text(result: FleetRun, summary: Mapping[str, Any]) -> str:
         *_cells(result, summary["cells"]),
         "",
         *_nodes(result, summary["load"]),
-        f"mean J: {summary['cost']:.3f}",
+        f"mean J: {METRICS['cost'].text(summary['cost'])}",
         f"moves: {summary['moves']}, of guards {summary['guard_moves']}{_told(summary['refused'])}",
         *_round_lines(summary["rounds"]),
     ]
@@ -379,6 +384,9 @@ def _told(refused: Mapping[str, int]) -> str:
 
 def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield the table of cells, with where each is over time."""
+    from dwell.study.metric import METRICS
+
+    rate, l95, cost = (METRICS[name] for name in ("violation_rate", "l95_ms", "cost"))
     candidates = dict.fromkeys(
         name for entry in result.fleet.entries for name in entry.cell.candidates
     )
@@ -387,10 +395,10 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
     rows = [
         [
             str(row["cell"]),
-            f"{row['violation_rate'] * 100:.2f}",
+            rate.number(row["violation_rate"]),
             str(row["verdict"]),
-            milliseconds(row["l95_ms"], 2),
-            f"{row['cost']:.3f}",
+            l95.number(row["l95_ms"]),
+            cost.number(row["cost"]),
             str(row["moves"]),
             "".join(letters[name] for name in _placements(result, str(row["cell"]))),
         ]
@@ -401,10 +409,10 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
         return
     head = [
         "cell, the worst first",
-        "V_D (%)",
+        rate.heading,
         "verdict",
-        "L95 (ms)",
-        "J",
+        l95.heading,
+        cost.heading,
         "moves",
         "where over time",
     ]
@@ -457,7 +465,9 @@ def _round_lines(rounds: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str:
     from dwell.report.capacity_page import answer, busy, errors, written
+    from dwell.study.metric import METRICS
 
+    rate = METRICS["violation_rate"]
     limits = found.limits
     excess = " above one cell alone" if found.limit_on == "excess" else ""
     point = found.point(found.robots)
@@ -482,8 +492,8 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
     rows = [
         [
             str(point.robots),
-            f"{point.violation_rate.value * 100:.2f}",
-            _ends(point.violation_rate),
+            rate.number(point.violation_rate.value),
+            _ends(point.violation_rate, rate),
             _bar(point.violation_rate.value / scale),
             busy(point),
         ]
@@ -494,7 +504,8 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
         *(f"{name.ljust(width)}  {value}" for name, value in facts),
         "",
         aligned(
-            [*("robots", "V_D (%)", "95 % interval"), THE_LIMIT.ljust(TIMES), "utilisation"], rows
+            ["robots", rate.heading, "95 % interval", THE_LIMIT.ljust(TIMES), "utilisation"],
+            rows,
         ),
     ]
     if changes:
@@ -506,8 +517,8 @@ def _capacity_text(of: Fleet, found: Capacity, changes: Sequence[WhatIf]) -> str
     return "\n".join(lines)
 
 
-def _ends(rate: Interval) -> str:
-    return f"[{rate.low * 100:.2f}, {rate.high * 100:.2f}]" if rate.known else "-"
+def _ends(rate: Interval, metric: Metric) -> str:
+    return f"[{metric.number(rate.low)}, {metric.number(rate.high)}]" if rate.known else "-"
 
 
 def _bar(share: float) -> str:

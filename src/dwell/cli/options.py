@@ -150,7 +150,7 @@ def windows_of(seconds: float, *problems: Problem) -> int:
     typer.BadParameter
         If the problems' windows differ in length.
     ProblemError
-        If a run may not have so many windows.
+        If a run with this number of windows is too long.
     """
     from dwell.model.instants import require_length
 

@@ -30,6 +30,8 @@ from dwell.record.run import NO_JOBS
 if TYPE_CHECKING:
     from dwell.files import Content
     from dwell.record import Run
+    from dwell.report.added import FolderPages
+    from dwell.report.page import Page
 
 #: A folder's own page.
 PAGE = "report.html"
@@ -64,15 +66,11 @@ def report(
 ) -> None:
     """Write the HTML page of a run, fleet, study or campaign."""
     from dwell.model.entry_points import PAGES, added
-    from dwell.record.fleet_run import is_fleet
     from dwell.report.added import FolderPages
-    from dwell.study.study_folder import is_study, open_study
 
     page = out or folder / PAGE
     folders = {name: kind for name, kind in added(PAGES).items() if isinstance(kind, FolderPages)}
-    kinds = {name: kind.holds for name, kind in folders.items()}
-    kinds |= {"study": is_study, "fleet": is_fleet}
-    kind = next((kind for kind, is_one in kinds.items() if is_one(folder)), "run")
+    kind = _kind_of(folder, folders)
     for what, wanted in (("a trace", trace), ("an MCAP file", mcap)):
         if wanted is not None and kind != "run":
             raise RunError(f"{folder} is a {kind}; name one of its runs for {what}")
@@ -86,42 +84,21 @@ def report(
         folders[kind].write(folder, page, figures=figures, static=static, as_json=as_json)
         return
     extras: dict[str, Any] = {}
-    files: dict[Path, Content] = {}
-    if kind == "fleet":
-        from dwell.record import open_fleet
-
-        fleet = open_fleet(folder)
-        if cells:
-            extras["cells"] = _write_cells(folder, fleet.cells, static=static)
+    if run is not None:
+        if trace is not None and not (run.is_simulated or run.has_jobs):
+            # A measured run cannot be made again for it.
+            typer.echo(f"note: no {trace}: {NO_JOBS}", err=True)
+            trace = None
+        extras["trace"] = trace
+        if lost := run.losses:
+            extras |= {"recovered": run.meta["recovered"], "lost": lost}
+        if mcap is not None:
+            extras["mcap"] = mcap
+    if cells:
+        extras["cells"] = _write_cells(folder, static=static)
     with working("writing the report"):
-        if kind == "fleet":
-            from dwell.report.fleet_page import fleet_page
-
-            document = fleet_page(fleet, links=_links(folder, page))
-        elif run is None:
-            from dwell.report.study_page import study_page
-
-            document = study_page(open_study(folder))
-        else:
-            from dwell.report.run_page import run_page
-
-            if trace is not None and not (run.is_simulated or run.has_jobs):
-                # A measured run cannot be made again for it.
-                typer.echo(f"note: no {trace}: {NO_JOBS}", err=True)
-                trace = None
-            extras["trace"] = trace
-            if lost := run.losses:
-                extras |= {"recovered": run.meta["recovered"], "lost": lost}
-            if trace is not None:
-                from dwell.report import trace_events
-
-                files[trace] = json.dumps(trace_events(run))
-            if mcap is not None:
-                from dwell.record.mcap_file import write_mcap
-
-                files[mcap] = partial(write_mcap, run)
-                extras["mcap"] = mcap
-            document = run_page(run)
+        document = _page_of(folder, kind, run, page)
+        files = {} if run is None else _files(run, trace, mcap)
         write_report(document, page, figures=figures, static=static, mark=mark)
         for path, content in files.items():
             write_file(path, content)
@@ -135,19 +112,61 @@ def report(
         typer.echo(f"note: {sentence}")
     if trace is not None:
         typer.echo(f"trace: {trace} (open it at https://ui.perfetto.dev)")
-    if mcap is not None:
-        typer.echo(f"mcap: {mcap}")
-    if figures is not None:
-        typer.echo(f"figures: {figures}")
+    for what, place in (("mcap", mcap), ("figures", figures)):
+        if place is not None:
+            typer.echo(f"{what}: {place}")
     if cells:
         typer.echo(f"cells: {folder}/*/{PAGE}")
 
 
-def _write_cells(folder: Path, runs: Mapping[str, Run], *, static: bool) -> dict[str, Path]:
+def _kind_of(folder: Path, folders: Mapping[str, FolderPages]) -> str:
+    """Return the kind of a folder: of an upper flat, a study, a fleet, or else a run."""
+    from dwell.record.fleet_run import is_fleet
+    from dwell.study.study_folder import is_study
+
+    kinds = {name: kind.holds for name, kind in folders.items()}
+    kinds |= {"study": is_study, "fleet": is_fleet}
+    return next((kind for kind, is_one in kinds.items() if is_one(folder)), "run")
+
+
+def _page_of(folder: Path, kind: str, run: Run | None, page: Path) -> Page:
+    """Return the page of a run, fleet or study."""
+    if run is not None:
+        from dwell.report.run_page import run_page
+
+        return run_page(run)
+    if kind == "fleet":
+        from dwell.record import open_fleet
+        from dwell.report.fleet_page import fleet_page
+
+        return fleet_page(open_fleet(folder), links=_links(folder, page))
+    from dwell.report.study_page import study_page
+    from dwell.study.study_folder import open_study
+
+    return study_page(open_study(folder))
+
+
+def _files(run: Run, trace: Path | None, mcap: Path | None) -> dict[Path, Content]:
+    """Return the further files of a run's report, with their contents."""
+    files: dict[Path, Content] = {}
+    if trace is not None:
+        from dwell.report import trace_events
+
+        files[trace] = json.dumps(trace_events(run))
+    if mcap is not None:
+        from dwell.record.mcap_file import write_mcap
+
+        files[mcap] = partial(write_mcap, run)
+    return files
+
+
+def _write_cells(folder: Path, *, static: bool) -> dict[str, Path]:
     """Write the page of each cell of a fleet next to its run; return the paths by cell."""
+    from dwell.record import open_fleet
     from dwell.report.run_page import run_page
 
     pages: dict[str, Path] = {}
+    runs = open_fleet(folder).cells
     with progress("writing the reports of cells") as shown:
         for name, run in runs.items():
             pages[name] = folder / name / PAGE

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -33,6 +32,7 @@ from dwell.cli.output import file_name, print_json, warn, working
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, RunError
 from dwell.model.bounds import counted
+from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.record.json_documents import read_document
 
 if TYPE_CHECKING:
@@ -41,6 +41,13 @@ if TYPE_CHECKING:
 
 #: Bytes of a run's default name at most; file systems take 255.
 LONGEST_NAME = 200
+#: Metrics on the terminal by column; `RARE` metrics only if they are not 0.
+SHOWN = (
+    *("l95_ms", "p50_ms", "p95_ms", "cost", "lost", "in_flight", "longest_misses"),
+    *("misses_in_20", "misses_in_100", "aoi_mean_ms", "aoi_p95_ms", "aoi_peak_ms"),
+    *("tracking_rms_mm", "tracking_iae_mm", "migrations", "guard_moves"),
+)
+RARE = {"in_flight", "tracking_rms_mm", "tracking_iae_mm", "guard_moves"}
 
 
 def run(
@@ -180,55 +187,32 @@ def _title(
 
 def _never_moving(placements: Mapping[str, Mapping[str, float]], problem: Problem) -> str:
     """Return the results of the initial placement, and of the best of all that were simulated."""
+    from dwell.study.metric import METRICS
+
     rates = {name: row["violation_rate"] for name, row in placements.items()}
     first, best = problem.initial, min(rates, key=rates.__getitem__)
-    line = f"{rates[first] * 100:.2f} % if it never moved from {first}"
-    return line if best == first else f"{line}; {rates[best] * 100:.2f} % if always on {best}"
+    texts = {name: METRICS["violation_rate"].text(rate) for name, rate in rates.items()}
+    line = f"{texts[first]} if it never moved from {first}"
+    return line if best == first else f"{line}; {texts[best]} if always on {best}"
 
 
 def _numbers(problem: Problem, row: Row) -> str:
-    shares = {name: float(row[f"share_{name}"]) for name in problem.candidates}
-    used = (f"{name} {row[f'node_{name}']:.0%}" for name in problem.fabric.resources)
-    unfinished = f"{row['in_flight']} of {row['cycles']}"
-    lines = (
-        ("L95, mean of windows", f"{milliseconds(float(str(row['l95_ms'])), 2)} ms"),
-        ("median latency", _latency(row["p50_ms"])),
-        ("95th percentile of all cycles", _latency(row["p95_ms"])),
-        ("cost J, mean of windows", f"{row['cost']:.3f}"),
-        ("cycles lost", f"{row['lost']} of {row['cycles']}"),
-        *([("unfinished at the end", unfinished)] if row["in_flight"] else []),
-        ("longest run of misses", f"{row['longest_misses']}"),
-        *_control(row),
-        ("migrations", f"{row['migrations']}"),
-        *([("moves of the guard", f"{row['guard_moves']}")] if row["guard_moves"] else []),
-        (
-            "windows by placement",
-            ", ".join(f"{name} {share:.0%}" for name, share in shares.items() if share),
-        ),
-        ("utilisation", ", ".join(used)),
-    )
-    width = max(len(name) for name, _ in lines)
-    return "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines)
+    from dwell.study.metric import METRICS, metric_of
 
+    values = {name: value for name, value in row.items() if not isinstance(value, str)}
 
-def _latency(value: object) -> str:
-    """``12.34 ms``; infinite where too many cycles never finished."""
-    latency_ms = float(str(value))
-    return (
-        f"{milliseconds(latency_ms, 2)} ms"
-        if math.isfinite(latency_ms)
-        else "∞: too many never finished"
-    )
+    def listed(template: str, names: Iterable[str]) -> str:
+        columns = {name: template.format(candidate=name, resource=name) for name in names}
+        texts = (
+            f"{name} {metric_of(column).text(values[column])}"
+            for name, column in columns.items()
+            if values[column] or template == USE_OF
+        )
+        return ", ".join(texts)
 
-
-def _control(row: Row) -> Iterator[tuple[str, str]]:
-    """Yield what the actuator got: misses in any K cycles, ages, and how the servo tracked."""
-    from dwell.study.summary import STRETCHES
-
-    most = ", ".join(f"{row[f'misses_in_{stretch}']} in {stretch}" for stretch in STRETCHES)
-    yield "most misses", f"{most} consecutive cycles"
-    ages = (milliseconds(float(str(row[f"aoi_{name}_ms"])), 2) for name in ("mean", "p95", "peak"))
-    yield "age at the actuator", "mean {}, p95 {}, peak {} ms".format(*ages)
-    if "tracking_rms_mm" in row:
-        rms, iae = row["tracking_rms_mm"], row["tracking_iae_mm"]
-        yield "tracking error", f"RMS {rms:.2f} mm, mean absolute (IAE / time) {iae:.2f} mm"
+    shown = (name for name in SHOWN if values.get(name, 0) or name not in RARE)
+    lines = {METRICS[name].title: METRICS[name].text(values[name]) for name in shown}
+    lines["windows by placement"] = listed(SHARE_OF, problem.candidates)
+    lines["utilisation"] = listed(USE_OF, problem.fabric.resources)
+    width = max(map(len, lines))
+    return "\n".join(f"{name.ljust(width)}  {value}" for name, value in lines.items())

@@ -28,8 +28,8 @@ from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
     from dwell.model.progress import Progress
-    from dwell.report.formatting import Measure
     from dwell.study import Study, StudyResult
+    from dwell.study.metric import Metric
 
 # Groups of a point and a scenario that the terminal shows; the tables have all.
 SHOWN = 40
@@ -104,7 +104,7 @@ def study(
             result = run_study(plan, folder=folder, processes=processes, dask=dask, progress=shown)
     if as_json:
         with working("intervals"):
-            table = result.table([measure.column for measure in _measures(plan)]).to_dicts()
+            table = result.table([metric.column for metric in _metrics(plan)]).to_dicts()
         head: dict[str, Any] = {"study": plan.name, "folder": folder}
         print_json({**head, "runs": result.runs.height, "table": table})
         return
@@ -134,12 +134,13 @@ def _interruptible(folder: Path, study: Study) -> Iterator[Progress]:
         )
 
 
-def _measures(study: Study) -> list[Measure]:
-    """Return the columns of the terminal."""
-    from dwell.report.formatting import COST, MIGRATIONS, ORACLE_REGRET, RATE, REGRET, own_measures
+def _metrics(study: Study) -> list[Metric]:
+    """Return the metrics on the terminal."""
+    from dwell.study.metric import metric_of
 
-    compared = [REGRET, ORACLE_REGRET] if study.references else []
-    return [RATE, COST, MIGRATIONS, *compared, *own_measures(study.metrics)]
+    compared = ["regret", "oracle_regret"] if study.references else []
+    columns = ["violation_rate", "cost", "migrations", *compared, *study.metrics]
+    return [metric_of(column) for column in columns]
 
 
 def _text(result: StudyResult) -> str:
@@ -150,25 +151,26 @@ def _text(result: StudyResult) -> str:
         shown_policy,
         shown_scenario,
     )
-    from dwell.report.table import Table, Text, table_text
+    from dwell.report.table import WITHOUT_WARMUP, Table, Text, table_text
     from dwell.study import over_seeds
 
     study = result.study
-    measures = _measures(study)
+    metrics = _metrics(study)
     groups = len(study.points) * len(study.scenarios)
     # Intervals take time, so only the shown rows get them.
     some = result.runs.head(SHOWN * len(study.policies) * len(study.seeds))
     keys = (*result.parameters, "scenario", "policy")
-    rows = over_seeds(some, keys, [measure.column for measure in measures]).to_dicts()
+    rows = over_seeds(some, keys, [metric.column for metric in metrics]).to_dicts()
     for row in rows:
         point = zip(study.parameters, result.parameters, strict=True)
         at = ", ".join(f"{name} = {row[column]}" for name, column in point)
         title = shown_scenario(row["scenario"])
         row |= {"policy": shown_policy(row["policy"]), "group": f"{title} ({at})" if at else title}
-    lines = [table_text(Table("", "", [Text("policy", ""), *measures], rows, Text("group", "")))]
+    lines = [table_text(Table("", "", [Text("policy", ""), *metrics], rows, Text("group", "")))]
     seeds = len(study.seeds)
     means = f"Mean over {seeds} seeds, with its 95 % interval" if seeds > 1 else "One seed"
-    lines.append(f"{means}{few_seeds(seeds) or '.'}{independent_runs(result.runs)}")
+    notes = few_seeds(seeds) or "."
+    lines.append(f"{means}{notes} {WITHOUT_WARMUP}{independent_runs(result.runs)}")
     if groups > SHOWN:
         lines.append(f"{SHOWN} of {groups} tables are shown; runs.parquet has all runs.")
     return "\n".join(lines)

@@ -220,6 +220,8 @@ class Controller:
         self._capacity = np.array([one.capacity for one in resources], float)
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = problem.pipeline.deadline_ns
+        #: Whether decisions are more frequent than windows.
+        self._has_looks = problem.decide_cycles < problem.window_cycles
         self._censor_ms = problem.censor_ms
         #: The policy's objective, else the cell's; its caps decide which candidates are eligible.
         self.objective: Objective = self._policy.objective or problem.objective
@@ -249,7 +251,7 @@ class Controller:
         has: dict[Feature, bool] = {
             "support": self.supports,
             "fleet": self.coordination is not None,
-            "between": self.problem.decide_cycles < self.problem.window_cycles,
+            "between": self._has_looks,
         }
         return tuple(feature for feature, there in has.items() if there)
 
@@ -656,7 +658,7 @@ class Controller:
 
     def _looked_at(self, observed: QoS) -> tuple[float | None, ...]:
         """Return the metrics of a decision, if a window can have several decisions."""
-        if "between" not in self.features:
+        if not self._has_looks:
             return ()
         used = map(observed.utilisation.get, self.resources)
         return observed.l95_ms, observed.violation_rate, *used

@@ -69,20 +69,18 @@ def _at_levels(
             options.append(_Option(name, cost + waits[group], units))
         cells.append(options)
     for first in range(0, len(levels), TOGETHER):
-        yield from _at_some(cells, first, min(first + TOGETHER, len(levels)), len(levels))
+        yield from _at_some(cells, first, min(first + TOGETHER, len(levels)))
 
 
-def _at_some(
-    cells: Sequence[Sequence[_Option]], first: int, end: int, levels: int
-) -> Iterator[tuple[str, ...]]:
+def _at_some(cells: Sequence[Sequence[_Option]], first: int, end: int) -> Iterator[tuple[str, ...]]:
     """Yield the cheapest placements at some of the levels."""
     # Smallest sum of costs of the cells so far, by level and by their work.
-    least, chosen = np.zeros((end - first, levels)), []
+    least, chosen = np.zeros((end - first, end)), []
     for options in cells:
         best, which = np.full_like(least, np.inf), np.zeros(least.shape, np.int16)
         for place, (_, cost, units) in enumerate(options):
-            if units < levels:
-                here = least[:, : levels - units] + cost[first:end, None]
+            if units < end:
+                here = least[:, : end - units] + cost[first:end, None]
                 lower = here < best[:, units:]
                 np.copyto(best[:, units:], here, where=lower)
                 np.copyto(which[:, units:], place, where=lower)

@@ -47,7 +47,13 @@ from dwell.control.watchdog import (
     Watchdog,
 )
 from dwell.cost import exceeds, excess, hamming
-from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices, PricedCell
+from dwell.estimators.fleet_prices import (
+    CellPrice,
+    CellTerms,
+    FleetPrice,
+    FleetPrices,
+    PricedCell,
+)
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.presents import Present
 from dwell.estimators.prices import prices_of
@@ -82,6 +88,8 @@ class FleetLedger:
         Called with the number of simulated levels of the table, and their total.
     limit : float, optional
         Largest V_D of a cell that is served, with the objective ``served``.
+    moves : bool
+        Whether a cell may move; without moves the table has no columns.
 
     Attributes
     ----------
@@ -110,9 +118,12 @@ class FleetLedger:
         prices: FleetPrices | None = None,
         progress: Progress | None = None,
         limit: float | None = None,
+        moves: bool = True,
     ) -> None:
         self.cells, self.shared, self.objective = tuple(cells), tuple(shared), objective
         problems = [cell.problem for cell in cells]
+        if table is None and not moves:
+            table = LoadTable(cells, shared, with_columns=False)
         self.table = table or load_table(tabled or cells, shared, progress)
         self.prices = prices or FleetPrices(cells, shared)
         self.loads = Loads(self.table)
@@ -138,6 +149,7 @@ class FleetLedger:
         self.turn_ns = max(round(problem.window_ms * 1e6) for problem in problems)
         self.absent: set[int] = set()
         self._watchdogs = [Watchdog(problem.window_cycles) for problem in problems]
+        self._expected: list[tuple[CellPrice, Expected] | None] = [None] * len(cells)
         #: Doubted candidates of each cell at the end of its last window.
         self._doubted: list[set[str]] = [set()] * len(self.cells)
         #: Number of changes of placements, of doubts and of the cells in Φ.
@@ -190,9 +202,8 @@ class FleetLedger:
             self._begin()
             price = self._search.play(tuple(self.placements))
             cell = None if price is None else price.cells[index]
-            cycles = self.cells[index].problem.window_cycles
             if cell is not None:
-                played = Expected.of(cell.windows, self._declared[index][name], cycles)
+                played = self._expect(index, cell)
                 if dog.compare(seen, played) and estimator.learns:
                     self.absent ^= {index}
                     self._changes += 1
@@ -203,6 +214,16 @@ class FleetLedger:
         self._changes += doubted != self._doubted[index]
         self._doubted[index] = doubted
         return dog.trusts
+
+    def _expect(self, index: int, played: CellPrice) -> Expected:
+        """Return the expected windows of a cell at its placement, computed once per simulation."""
+        known = self._expected[index]
+        if known is None or known[0] is not played:
+            price = self._declared[index][self.placements[index]]
+            cycles = self.cells[index].problem.window_cycles
+            known = played, Expected.of(played.windows, price, cycles)
+            self._expected[index] = known
+        return known[1]
 
     def _begin(self) -> None:
         """Pass the measured conditions to the simulation; absent cells add none of shared nodes."""

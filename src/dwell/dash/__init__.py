@@ -1,1 +1,1 @@
-"""The web page of a live cell, and of a recorded run."""
+"""Web page of a live cell, a recorded run, a recorded fleet or a folder of runs."""

@@ -103,7 +103,7 @@ class Gate:
         """Return the status and reason of a refusal; None if the request may pass."""
         host = headers.get("host", "")
         if not HOST.fullmatch(host):
-            return HTTPStatus.FORBIDDEN, "this page is asked for by the name of this computer only"
+            return HTTPStatus.FORBIDDEN, "open this page by the name of this computer only"
         if scope["path"] in OPEN:
             return None
         if not (brings or self._known(headers)):
@@ -114,11 +114,11 @@ class Gate:
         if scope["method"] in ("GET", "HEAD"):
             return None
         if headers.get("origin", "").lower() != f"http://{host.lower()}":
-            return HTTPStatus.FORBIDDEN, "what acts has to come from this page (Origin)"
+            return HTTPStatus.FORBIDDEN, "a command must come from this page (Origin)"
         if headers.get("sec-fetch-site", "same-origin") != "same-origin":
-            return HTTPStatus.FORBIDDEN, "what acts has to come from this page (Sec-Fetch-Site)"
+            return HTTPStatus.FORBIDDEN, "a command must come from this page (Sec-Fetch-Site)"
         if ACTS not in headers:
-            return HTTPStatus.FORBIDDEN, f"what acts has to say so (header {ACTS})"
+            return HTTPStatus.FORBIDDEN, f"a command needs the header {ACTS}"
         return None
 
     def _known(self, headers: Mapping[str, str]) -> bool:

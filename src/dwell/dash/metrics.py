@@ -34,23 +34,23 @@ EVERY_S = 2.0
 #: Help text of each metric except the latency histogram, by kind.
 SENTENCES: Mapping[Kind, Mapping[str, str]] = {
     "gauge": {
-        "dwell_health": "1 of the health that the cell has, 0 of every other.",
+        "dwell_health": "1 for the current health of the cell, 0 for every other health.",
         "dwell_deadline_seconds": "Deadline of a cycle.",
-        "dwell_guard_fallback": "Whether the cell is where its guard has put it.",
+        "dwell_guard_fallback": "Whether the guard chose the current placement.",
         "dwell_release_ratio": "Cycles released per period, over the time of three windows.",
-        "dwell_violation_ratio": "Share of the cycles that the last decision looked at that "
-        "missed.",
-        "dwell_estimated_cost": "Cost J of a candidate as estimated for the last decision.",
-        "dwell_utilisation_ratio": "Utilisation of a resource over the cycles that the last "
-        "decision looked at, foreign work included.",
-        "dwell_clock_bound_seconds": "Largest error of the latencies of the last window, by the "
+        "dwell_violation_ratio": "Share of missed cycles among the cycles of the last decision.",
+        "dwell_estimated_cost": "Estimated cost J of a candidate at the last decision.",
+        "dwell_utilisation_ratio": "Utilisation of a resource over the cycles of the last "
+        "decision, foreign work included.",
+        "dwell_clock_bound_seconds": "Largest error of latencies in the last window due to the "
         "clocks.",
-        "dwell_window_unproven": "Whether clocks or losses of messages leave the last window "
+        "dwell_window_unproven": "Whether clock errors or lost messages leave the last window "
         "unproven.",
-        "dwell_process_heard": "Whether the controller hears a process of the cell.",
-        "dwell_process_ready": "Whether a process that is heard can do its work.",
-        "dwell_certificate_days": "Days until the certificate ends that a node or the controller "
-        "uses; negative afterwards.",
+        "dwell_process_heard": "Whether the controller receives messages from a process of the "
+        "cell.",
+        "dwell_process_ready": "Whether a process can do its work; absent for silent processes.",
+        "dwell_certificate_days": "Days until the certificate in use by a node or the controller "
+        "ends; negative afterwards.",
         "dwell_certificate_expiry_timestamp_seconds": "Instant at which a subject's newest "
         "certificate ends.",
     },
@@ -59,20 +59,22 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
     },
     "info": {
         "dwell_placement": "Placement of the newest cycle.",
-        "dwell_task_placement": "Where a task runs under the placement of the newest cycle.",
+        "dwell_task_placement": "Node of a task under the placement of the newest cycle.",
     },
     "counter": {
-        "dwell_cycles": "Cycles since the observer began, by what became of them.",
-        "dwell_missed_cycles": "Cycles since the observer began that missed.",
-        "dwell_unread_cycles": "Cycles that dwell_cycle_latency_seconds lacks, since this process "
-        "was too slow.",
-        "dwell_silences": "Calls of hold() or zero() since the controller began, except for one "
-        "that lasts.",
-        "dwell_migrations": "Moves of the cell since the controller began, by reason; those of the "
-        "guard among them.",
-        "dwell_windows": "Closed windows of the run.",
-        "dwell_stage_inputs": "Inputs of a stage since its state folder was made, by outcome.",
-        "dwell_flow_bytes": "Payloads sent in a flow since its sender's state folder was made.",
+        "dwell_cycles": "Cycles since the start of the observer, by outcome.",
+        "dwell_missed_cycles": "Missed cycles since the start of the observer.",
+        "dwell_unread_cycles": "Cycles missing from dwell_cycle_latency_seconds because this "
+        "process was too slow.",
+        "dwell_silences": "Calls of hold() or zero() before an applied command, since the start of "
+        "the controller.",
+        "dwell_migrations": "Moves of the cell since the start of the controller, by reason, "
+        "including the guard's moves.",
+        "dwell_windows": "Ended windows of the run.",
+        "dwell_stage_inputs": "Inputs of a stage since the creation of its state folder, by "
+        "outcome.",
+        "dwell_flow_bytes": "Payload bytes sent in a flow since the creation of its sender's state "
+        "folder.",
     },
 }
 #: Suffix of a metric's name in its samples.
@@ -191,15 +193,7 @@ class CellMetrics(Collector):
             "dwell_silences": [({}, status.get("silences"))],
             "dwell_migrations": [({"reason": one}, moves.get(one)) for one in MOVED_BY],
             "dwell_windows": [({}, status.get("windows"))],
-            "dwell_stage_inputs": [
-                ({**_stage(name), "outcome": end}, count)
-                for name, one in stages.items()
-                for end, count in one["inputs_total"].items()
-            ],
-            "dwell_flow_bytes": [
-                (dict(zip(("source", "target"), name.split("->"), strict=True)), one["bytes_total"])
-                for name, one in flows.items()
-            ],
+            **_totals(stages, flows),
         }
 
     def _certificates(self) -> Samples:
@@ -221,6 +215,21 @@ class CellMetrics(Collector):
                     exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
                     of_cell = self._latency.labels(self._problem.name)
                     of_cell.observe(cycle.latency_ns / 1e9, exemplar)
+
+
+def _totals(stages: Mapping[str, Any], flows: Mapping[str, Any]) -> dict[str, Samples]:
+    """Return the counts of the stages' inputs and the flows' bytes since their start."""
+    return {
+        "dwell_stage_inputs": [
+            ({**_stage(name), "outcome": end}, count)
+            for name, one in stages.items()
+            for end, count in one["inputs_total"].items()
+        ],
+        "dwell_flow_bytes": [
+            (dict(zip(("source", "target"), name.split("->"), strict=True)), one["bytes_total"])
+            for name, one in flows.items()
+        ],
+    }
 
 
 def _stage(name: str) -> dict[str, str]:

@@ -32,6 +32,7 @@ from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
+from dwell.record import shown_reason
 
 #: Largest number of cycles (with jobs, 2 to 3 kB each), windows and events in memory.
 MOST_CYCLES, MOST_WINDOWS, MOST_EVENTS = 4_000, 4_000, 1_000
@@ -287,9 +288,8 @@ class Observer:
                     self._take(arrival)
             case "stamped":
                 self._stamped(decode(sample.payload, Stamped))
-            case "beat":
-                beat = self._pulse.receive(sample, time.time_ns())
-                if beat is not None:
+            case "beat" | "beats":
+                for beat, _, _ in self._pulse.receive(sample, time.time_ns()):
                     for heard in beat.heard:
                         self._offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
             case "done" | "ended":
@@ -435,7 +435,7 @@ def _why(answers: Sequence[Mapping[str, Any]], new: str, *, guarded: bool) -> st
     for status in answers:
         if status.get("drained"):
             return f"{', '.join(status['drained'])} drained"
-    return str((answers[0].get("window") or {}).get("reason") or "ordered")
+    return shown_reason(str((answers[0].get("window") or {}).get("reason") or "ordered"))
 
 
 def _outcome(cycle: LiveCycle) -> str:

@@ -1,7 +1,7 @@
-"""PagedCell: a cell as the page sees it, whether it runs or is recorded.
+"""PagedCell: interface of a live or recorded cell to the page.
 
-A page shows one cell or several on one time line. All instants that pass between page and server
-are places on it: seconds since the first release, or numbers of cycles.
+A page shows one or more cells on one time line. Page and server exchange instants as places on the
+time line: seconds since the first release, or numbers of cycles.
 """
 
 from __future__ import annotations
@@ -13,41 +13,43 @@ from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 from dwell.display import placement_hues
 from dwell.model import Link, Problem, Trace
 from dwell.model.bounds import counted
+from dwell.study.metric import METRICS
 
-#: What a place on the time line counts.
+RATE = METRICS["violation_rate"]
+#: Unit of places on the time line: seconds or cycles.
 Unit: TypeAlias = Literal["s", "cycle"]
 #: Plain values, ready for JSON.
 Plain: TypeAlias = dict[str, Any]
 
-#: Health of a recorded run before its first window has closed.
+#: Health and headline of a recorded run before the end of its first window.
 UNMEASURED, NO_WINDOW = "unmeasured", "no window has closed yet"
-#: Cycles of which the jobs are told at a time.
+#: Largest number of cycles in one answer with jobs.
 MOST_WITH_JOBS = 200
 
 
 class PagedCell(Protocol):
-    """See the module; every method returns at once, from any thread."""
+    """Interface of a cell to the page; methods may be called from any thread."""
 
     live: bool
 
     def described(self) -> Plain:
-        """Return what does not change, and where its time line begins and ends."""
+        """Return the constant data of the cell, and the begin and end of its time line."""
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
-        """Return what is drawn between two places, in so many bins at most."""
+        """Return the data of the charts between two places, in at most `bins` bins."""
 
     def state(self, at: float) -> Plain:
-        """Return how the cell was at a place; a cell that runs, how it is."""
+        """Return the state of the cell at a place; of a live cell, the current state."""
 
     def jobs(self, begin: float, end: float) -> Plain:
-        """Return the jobs of the cycles between two places, as far as they are known."""
+        """Return the known jobs of the cycles between two places."""
 
     def refreshed(self) -> bool:
-        """Whether there is more of it than at the last call."""
+        """Read new data; return whether there are any since the last call."""
 
 
 def cell_document(problem: Problem) -> Plain:
-    """Return what a page draws of a cell: its computers, stages and candidates."""
+    """Return the constant data of a cell: its computers, links, stages and candidates."""
     fabric, pipeline = problem.fabric, problem.pipeline
     hues = placement_hues(problem.candidates)
     return {
@@ -55,6 +57,7 @@ def cell_document(problem: Problem) -> Plain:
         "period_ms": pipeline.period_ms,
         "deadline_ms": pipeline.deadline_ms,
         "window_cycles": problem.window_cycles,
+        "dwell_cycles": problem.dwell_cycles,
         "nodes": [
             {"name": node.name, "tier": node.tier, "cores": node.cores}
             for node in fabric.nodes.values()
@@ -79,7 +82,7 @@ def cell_document(problem: Problem) -> Plain:
 
 
 class TimedCycle(NamedTuple):
-    """A cycle whose jobs are shown; without a latency it is lost, or not done."""
+    """A cycle whose jobs are shown; without a latency it is lost or incomplete."""
 
     number: int
     release_ns: int
@@ -90,7 +93,7 @@ class TimedCycle(NamedTuple):
 def jobs_document(
     cycles: Sequence[TimedCycle], jobs: Iterable[Mapping[str, Any]], *, known: bool = True
 ) -> Plain:
-    """Return cycles and their jobs, in ms since the first of these releases."""
+    """Return cycles and their jobs; times are in ms since the earliest of these releases."""
     origin_ns = min((cycle.release_ns for cycle in cycles), default=0)
 
     def since(at_ns: int | None) -> float | None:
@@ -121,7 +124,7 @@ def jobs_document(
 
 
 def _link(link: Link) -> str:
-    """Return delay and rate of a link, as written beside it."""
+    """Return the label of a link: its delay and, if limited, its rate."""
     delay = "as recorded" if isinstance(link.delay_ms, Trace) else None
     parts = [delay or f"{link.delay_ms.expectation:.3g} ms"]
     if not math.isinf(link.rate_mbps):
@@ -130,7 +133,7 @@ def _link(link: Link) -> str:
 
 
 def health_by(problem: Problem, rates: list[float]) -> Mapping[str, str | None]:
-    """Return health and headline of a cell of which the last windows' V_D is all that is known."""
+    """Return health and headline of a cell from V_D of its last windows alone."""
     if not rates:
         return {"health": UNMEASURED, "headline": NO_WINDOW}
     if not problem.live.degraded_by(rates):
@@ -138,5 +141,5 @@ def health_by(problem: Problem, rates: list[float]) -> Mapping[str, str | None]:
     rate = sum(rates) / len(rates)
     return {
         "health": "degraded",
-        "headline": f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}",
+        "headline": f"{RATE.name} is {RATE.text(rate)} in the last {counted(len(rates), 'window')}",
     }

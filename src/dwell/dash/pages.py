@@ -1,4 +1,4 @@
-"""Pages: what `dwell dash` shows of a run, of two, of a fleet's runs, or of a live cell."""
+"""Pages of `dwell dash`: a run, two runs, the runs of a fleet or of a folder, or a live cell."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,63 +18,55 @@ if TYPE_CHECKING:
     from dwell.dash.observer import Observer
     from dwell.dash.server import Dash
 
-#: Folders of runs that are named.
-MOST_NAMED = 8
-
 
 def recorded_page(folder: Path, beside: Path | None) -> Dash:
-    """Read a recorded run, two for one time line, or the runs of a fleet.
+    """Read a recorded run, two runs on one time line, the runs of a fleet, or a folder of runs.
 
-    Raises
-    ------
-    RunError
-        If a folder is neither, or damaged, or no run of a fleet is whole.
+    Raises `RunError` if a folder has none of these or is damaged, or if all runs of a fleet are
+    incomplete.
     """
     with ThreadPoolExecutor(1) as reader:
         reading = reader.submit(_read, folder, beside)
-        # Meanwhile: both take as long.
+        # Import the server while the other thread reads; both take equally long.
         from dwell.dash.server import Dash
 
         return Dash(**reading.result())
 
 
 def _require_run(folder: Path) -> None:
-    """Refuse a folder that is not one run, and name those in it."""
+    """Refuse a fleet, or a folder without a run."""
     if is_run(folder) or not folder.is_dir():
         return
     if is_fleet(folder):
         raise RunError(f"{folder}: a fleet; name the folder of one of its cells")
-    below = (*folder.glob("*"), *folder.glob("runs/*"))
-    runs = sorted(path.relative_to(folder).as_posix() for path in below if is_run(path))
-    if runs:
-        more = f", and {len(runs) - MOST_NAMED} more" if len(runs) > MOST_NAMED else ""
-        named = ", ".join(runs[:MOST_NAMED])
-        raise RunError(
-            f"{folder}: not a run, and no fleet (it has no fleet.json); it holds {named}{more}: "
-            "name one of them, and another with --beside"
-        )
+    raise RunError(f"{folder}: not a run; --beside compares two folders with one run each")
 
 
 def _read(folder: Path, beside: Path | None) -> dict[str, Any]:
-    """Return a fleet, or runs and the unit of their time line: cycles where these are the same."""
+    """Return a fleet, a folder of runs, or one or two runs with the unit of their time line."""
     if is_fleet(folder):
         from dwell.dash.recorded_fleet import RecordedFleet
 
         return {"fleet": RecordedFleet(folder)}
+    if beside is None and folder.is_dir() and not is_run(folder):
+        from dwell.dash.runs_folder import RunsFolder
+
+        runs = RunsFolder(folder)
+        runs.start()
+        return {"runs": runs}
     for path in filter(None, (folder, beside)):
         _require_run(path)
-    from dwell.dash.recorded_cell import RecordedCell, same_realisation
+    from dwell.dash.recorded_cell import RecordedCell, difference, same_realisation
 
     one = RecordedCell(folder)
     if beside is None:
         return {"cells": [one]}
     other = RecordedCell(beside)
-    if same_realisation(one.run, other.run):
-        cells = [RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")]
-        line = "by number of the cycle: both runs met the same realisation"
-        return {"cells": cells, "line": line}
     line = "by seconds since the first release: the runs met different realisations"
-    return {"cells": [one, other], "line": line}
+    if same_realisation(one.run, other.run):
+        one, other = RecordedCell(folder, "cycle"), RecordedCell(beside, "cycle")
+        line = "by number of the cycle: both runs met the same realisation"
+    return {"cells": [one, other], "line": line, "difference": partial(difference, one, other)}
 
 
 @contextmanager
@@ -84,23 +77,11 @@ def live_page(
     control: bool,
     mcap: Path | None = None,
 ) -> Iterator[Dash]:
-    """Observe a live cell.
+    """Observe a live cell, and record it to a new file `mcap` if that is given.
 
-    Parameters
-    ----------
-    environment : mapping of str to str
-        With the variables of `dwell.live.host.security`.
-    control : bool
-        Whether the page may act.
-    mcap : Path, optional
-        File to record it to; there must be none.
-
-    Raises
-    ------
-    TrustError
-        If it may not with these keys, or without any.
-    OSError
-        If the file is there, or cannot be made.
+    `environment` has the variables of `dwell.live.host.security`; `control` allows the page to send
+    commands. Raises `TrustError` if the keys do not allow this, and `OSError` if the file exists or
+    cannot be created.
     """
     from dwell.cellfile import load_without_traces
     from dwell.dash.metrics import CellMetrics
@@ -123,7 +104,7 @@ def live_page(
 
 
 def _require_operator(observer: Observer) -> None:
-    """Refuse to act with the keys of somebody who may only look, or without keys on a network."""
+    """Refuse commands with the keys of an observer, or without keys for a cell on a network."""
     from dwell.live.host.security import exposed
 
     keyring = observer.security.keyring
@@ -137,7 +118,7 @@ def _require_operator(observer: Observer) -> None:
 
 
 def _logged(observer: Observer) -> Callable[[str, str], Mapping[str, Any]]:
-    """Return what carries out acts, and says of each when, what, by whose certificate, and how."""
+    """Return a function that sends commands; it logs time, command, certificate and result."""
     keyring = observer.security.keyring
     who = "without keys" if keyring is None else f"by {keyring.own.common_name}"
 

@@ -1,10 +1,9 @@
-"""RecordedCell: a run's folder as the page sees it; also one that another process still writes."""
+"""RecordedCell: the folder of a run on the page; another process may still write the run."""
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,32 +17,34 @@ from dwell.dash.paged_cell import (
     cell_document,
     jobs_document,
 )
-from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
+from dwell.dash.recorded_events import (
+    RecordedEvents,
+    bands_of,
+    disturbance_events,
+    disturbances_met,
+    disturbed_at,
+    merged,
+)
 from dwell.dash.recorded_windows import RecordedWindows, placement_codes
-from dwell.dash.strip import Strip, binned_means, plain
+from dwell.dash.run_verdict import verdict_document
+from dwell.dash.strip import Strip, binned_means, difference_of_misses, plain
 from dwell.errors import RunError
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats
 from dwell.record import Run, open_run
 
-#: Cycles before a place among which the newest one in effect is looked for.
+#: Number of cycles before a place to search for the newest cycle in effect.
 LOOK_BACK = 4_000
-#: A run that is being written is read again after this many times what that takes, and a while.
+#: Facts of a run that the page shows; policy for which the page shows the placement.
+ABOUT, STATIC = ("kind", "scenario", "policy", "estimator", "seed"), "Static"
+#: Pause before a growing run is read again: this multiple of the reading time, and at least 1 s.
 REST, LEAST_REST_S = 5.0, 1.0
 
 
 class RecordedCell:
-    """See the module and `PagedCell`.
+    """A recorded run on the page (see `PagedCell`); `unit` is the unit of its time line.
 
-    Parameters
-    ----------
-    unit : {"s", "cycle"}
-        What its time line counts.
-
-    Raises
-    ------
-    RunError
-        If the folder is no run, is damaged, or has no cycles.
+    Raises `RunError` if the folder is no run, is damaged, or has no cycles.
     """
 
     live = False
@@ -52,10 +53,10 @@ class RecordedCell:
         self.folder, self.unit = folder, unit
         self._reading = threading.Lock()
         self._size, self._read_again_s = self._bytes(), 0.0
-        self._contents = self._read()
+        self.contents = self._read()
 
     def _bytes(self) -> int:
-        """Return how long the folder's files are."""
+        """Return the total size of the folder's files."""
         return sum(file.stat().st_size for file in self.folder.glob("*") if file.is_file())
 
     def _read(self) -> _Contents:
@@ -66,15 +67,15 @@ class RecordedCell:
         return contents
 
     def refreshed(self) -> bool:
-        """See `PagedCell`; what cannot be read meanwhile is read the next time."""
-        if not self._contents.growing or time.monotonic() < self._read_again_s:
+        """See `PagedCell`; if reading fails, the next call tries again."""
+        if not self.contents.growing or time.monotonic() < self._read_again_s:
             return False
         with self._reading:
             size = self._bytes()
             if size == self._size:
                 return False
             try:
-                self._contents = self._read()
+                self.contents = self._read()
             except (RunError, OSError):
                 self._read_again_s = time.monotonic() + LEAST_REST_S
                 return False
@@ -83,28 +84,51 @@ class RecordedCell:
 
     @property
     def run(self) -> Run:
-        """The run as it was read last."""
-        return self._contents.run
+        """The run as last read."""
+        return self.contents.run
 
     def described(self) -> Plain:
         """See `PagedCell`."""
-        return self._contents.described()
+        return self.contents.described()
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
         """See `PagedCell`."""
-        return self._contents.view(begin, end, bins)
+        return self.contents.view(begin, end, bins)
 
     def state(self, at: float) -> Plain:
         """See `PagedCell`."""
-        return self._contents.state(at)
+        return self.contents.state(at)
 
     def jobs(self, begin: float, end: float) -> Plain:
         """See `PagedCell`."""
-        return self._contents.jobs(begin, end)
+        return self.contents.jobs(begin, end)
+
+
+def difference(
+    one: RecordedCell, other: RecordedCell, begin: float, end: float, bins: int
+) -> Plain:
+    """Return V_D of the second run minus V_D of the first between two places, per bin."""
+    first, second = one.contents, other.contents
+    length = max(first.window, second.window)
+    return difference_of_misses(second.strip, first.strip, begin, end, bins, length)
+
+
+def policy_of(run: Run, placed: NDArray[np.int32]) -> str | None:
+    """Return the name of the policy; for a run that never moves, the name of its placement.
+
+    `placed` has the index of each window's placement in the candidates.
+    """
+    policy = run.meta.get("policy")
+    if policy is None:
+        return None
+    name = str(policy).partition("(")[0].strip()
+    if name == STATIC and len(placed):
+        return f"{list(run.problem.candidates)[placed[0]]}, without moves"
+    return name
 
 
 def same_realisation(one: Run, other: Run) -> bool:
-    """Whether two runs met the same draws, cycle by cycle."""
+    """Whether two runs are simulated with the same random samples, cycle by cycle."""
     simulated = one.is_simulated and other.is_simulated
     drawn = [(run.meta.get("seed"), run.meta.get("scenario")) for run in (one, other)]
     return simulated and drawn[0] == drawn[1] and one.problem.drawn == other.problem.drawn
@@ -133,21 +157,22 @@ class _Contents:
             number=self._cycle,
         )
         size, period_s = self.problem.window_cycles, self.problem.pipeline.period_ms / 1e3
-        length = size * period_s if unit == "s" else size
-        self.windows = RecordedWindows(run, self.problem, self._begins, length)
-        self._events = RecordedEvents([*self.windows.events(), *self._disturbances()])
+        self.window = size * period_s if unit == "s" else float(size)
+        self.windows = RecordedWindows(run, self.problem, self._begins, self.window)
+        end_s = float(self._release_ns[-1]) / 1e9
+        met = disturbances_met(run, run.disturbances)
+        self._bands = bands_of(met, self._place, end_s)
+        happened = (
+            {**event, "at": self._place(event["at"])}
+            for event in disturbance_events(met, self.problem, end_s)
+        )
+        self._events = RecordedEvents([*self.windows.events(), *happened])
+        self._verdict = {} if self.growing else verdict_document(run, self.problem)
 
     def _begins(self, first: NDArray[np.int64]) -> Floats:
         """Return the places of cycles by their numbers."""
         rows = np.minimum(np.searchsorted(self._cycle, first), len(self._cycle) - 1)
         return self.strip.at[rows]
-
-    def _disturbances(self) -> Iterator[Plain]:
-        """Yield what the scenario did."""
-        end_s = float(self._release_ns[-1]) / 1e9
-        met = disturbances_met(self.run, self.run.disturbances)
-        for event in disturbance_events(met, self.problem, end_s):
-            yield {**event, "at": self._place(event["at"])}
 
     def _place(self, at_s: float) -> float:
         """Return the place on the time line of an instant, seconds since the first release."""
@@ -157,9 +182,10 @@ class _Contents:
         return float(self._cycle[min(row, len(self._cycle) - 1)])
 
     def described(self) -> Plain:
-        meta = self.run.meta
+        about = {name: self.run.meta.get(name) for name in ABOUT} | {
+            "policy": policy_of(self.run, self.windows.placement)
+        }
         cycle = self.problem.pipeline.period_ms / 1e3 if self.unit == "s" else 1.0
-        told = ("kind", "scenario", "policy", "estimator", "seed")
         return {
             **cell_document(self.problem),
             "source": self.source,
@@ -168,12 +194,15 @@ class _Contents:
             "unit": self.unit,
             "begin": float(self.strip.at[0]),
             "end": float(self.strip.at[-1]) + cycle,
-            "about": {name: str(meta[name]) for name in told if meta.get(name) is not None},
+            "about": {name: str(value) for name, value in about.items() if value is not None},
             "cycles": len(self.strip.at),
             "missed": int(self.strip.missed.sum()),
             "windows": len(self.windows.number),
             "has_jobs": self.run.has_jobs,
             "notes": self.run.losses,
+            "worst": self.windows.worst(),
+            "disturbed": merged(self._bands),
+            **self._verdict,
         }
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
@@ -199,11 +228,12 @@ class _Contents:
             "placement": self._candidates[code] if code >= 0 else None,
             **self.windows.health(k),
             "age_ms": self._age_ms(at, row),
+            "disturbed": disturbed_at(self._bands, at),
             **({} if k < 0 else self.windows.window(k) | self.windows.estimates(k)),
         }
 
     def _age_ms(self, at: float, row: int) -> float | None:
-        """Return the age of the newest cycle in effect at a place."""
+        """Return the age in ms of the newest completed cycle at a place; None if unknown."""
         if row < 0:
             return None
         now_ms = float(self._release_ns[row]) / 1e6

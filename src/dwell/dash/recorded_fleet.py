@@ -1,7 +1,7 @@
-"""RecordedFleet: a fleet's folder as the page sees it.
+"""RecordedFleet: the folder of a fleet on the page.
 
-It has the windows and the decisions of every cell, and the cycles of those cells alone that are
-opened. Places on its time line are seconds since the run's beginning.
+It reads the windows and decisions of every cell, but cycles only for a cell that the user opens.
+Places on its time line are seconds since the begin of the run.
 """
 
 from __future__ import annotations
@@ -19,37 +19,48 @@ from numpy.typing import NDArray
 
 from dwell.dash.paged_cell import NO_WINDOW, UNMEASURED, Plain
 from dwell.dash.recorded_cell import RecordedCell
-from dwell.dash.recorded_events import RecordedEvents, disturbance_events, disturbances_met
+from dwell.dash.recorded_events import (
+    Band,
+    RecordedEvents,
+    bands_of,
+    disturbance_events,
+    disturbances_met,
+    merged,
+)
 from dwell.dash.recorded_windows import RecordedWindows
 from dwell.dash.strip import Strip, binned_means, plain
 from dwell.display import placement_hues
 from dwell.errors import RunError
-from dwell.model import Problem
+from dwell.model import Problem, Scenario
 from dwell.model.fleet import FleetCell
 from dwell.model.number_arrays import Floats
 from dwell.record import FleetRun, Run, open_fleet
 from dwell.record.fleet_run import how_many_are_whole, listed
+from dwell.study.kept_bounds import AIM
+from dwell.study.verdict import verdict_of
 
-#: Bins of all cells together at most: some 90 bytes each.
+#: Largest number of bins of all cells together (about 90 bytes each); smallest number per cell.
 MOST_BINS, LEAST_BINS = 8_000, 10
-#: Opened cells that are kept.
+#: Number of opened cells in memory.
 MOST_OPEN = 16
-#: Columns of a cell's bins that the page draws.
+#: Columns of the bins that the page draws.
 DRAWN = ("at", "high", "lost")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Member:
-    """A cell whose run is whole.
+    """A cell whose run is complete.
 
     Parameters
     ----------
     place : int
-        In the fleet's file.
+        Index in the fleet's file.
     rate : float
-        V_D after the warm-up; NaN where no window is.
+        Mean V_D after the warm-up; NaN without such windows.
+    verdict : str or None
+        Word of the verdict on the cell (`dwell.study.verdict`), if it has such windows.
     strip : Strip
-        Of its windows: L95, and whether it is over the deadline.
+        The windows instead of cycles: L95, and whether it exceeds the deadline.
     """
 
     place: int
@@ -57,25 +68,26 @@ class _Member:
     problem: Problem
     windows: RecordedWindows
     rate: float
+    verdict: str | None
     strip: Strip
 
     @property
     def placed(self) -> list[str]:
-        """The placements that its windows have."""
+        """Names of the placements in the windows."""
         names = list(self.problem.candidates)
         return [names[code] for code in np.unique(self.windows.placement).tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Rounds:
-    """Φ of the fleet where the ledger was asked, in the order of the closes.
+    """Φ of the fleet at each request to the ledger, sorted by time.
 
     Parameters
     ----------
     at, before, after : float64 array, shape (n,)
-        When; Φ as it was, and as it came to be.
+        End of the window, in seconds; Φ before and after the decision.
     number : int64 array, shape (n,)
-        Of the round.
+        Number of the round.
     """
 
     at: Floats
@@ -84,20 +96,15 @@ class _Rounds:
     number: NDArray[np.int64]
 
     def view(self, begin: float, end: float, bins: int, cells: int) -> Plain:
-        """Return Φ a cell between two places, before and after where the ledger was asked."""
+        """Return Φ per cell between two places, before and after each request to the ledger."""
         phi = np.column_stack([self.before, self.after]).ravel() / cells
         return binned_means(np.repeat(self.at, 2), {"phi": phi}, begin, end, bins)
 
 
 class RecordedFleet:
-    """See the module.
+    """A recorded fleet on the page; cells are sorted by V_D after the warm-up, worst first.
 
-    Its cells stand worst first, by V_D after the warm-up.
-
-    Raises
-    ------
-    RunError
-        If the folder is no fleet's, or no run in it is whole.
+    Raises `RunError` if the folder has no fleet or no complete run.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -113,19 +120,21 @@ class RecordedFleet:
         candidates = dict.fromkeys(name for one in self._members for name in one.problem.candidates)
         used = {name for one in self._members for name in one.placed}
         self._hues = placement_hues(candidates)
-        # Those where a cell ever is.
+        # Only the placements that some window uses.
         self._placements = {name: i for i, name in enumerate(n for n in candidates if n in used)}
         self._end = max(float(one.windows.closes[-1]) for one in self._members)
         self._rounds = _rounds(self._members)
         self._grid, self._load = self._shared_load()
         self._lines = self._over_time()
-        self._events = RecordedEvents(self._all_events())
+        met = [self._met(one) for one in self._members]
+        self._events = RecordedEvents(self._all_events(met))
+        self._bands = self._all_bands(met)
         self.cell = lru_cache(MOST_OPEN)(self._open)
 
-    # --------------------------------------------------------------------- what is read
+    # --------------------------------------------------------------------- reading
 
     def _whole(self, run: FleetRun) -> Iterator[_Member]:
-        """Yield the cells whose windows and decisions can be read; why others cannot is a fault."""
+        """Yield the cells with readable windows and decisions; add a fault for each other cell."""
         for place, cell in enumerate(run.fleet.cells):
             if cell.name not in run.cells:
                 continue
@@ -138,7 +147,7 @@ class RecordedFleet:
         return how_many_are_whole(len(self._members), self.count)
 
     def _shared_load(self) -> tuple[Floats, dict[str, Floats]]:
-        """Return the closes of the fleet's windows, and the load of shared nodes in them."""
+        """Return the ends of the fleet's windows, and the load of the shared nodes in them."""
         try:
             table = self._run.load
         except RunError as error:
@@ -150,7 +159,7 @@ class RecordedFleet:
         return closes, {name.removeprefix("u_"): table[name].to_numpy() for name in names}
 
     def _over_time(self) -> dict[str, Floats]:
-        """Return what is drawn as lines: load, cells by placement."""
+        """Return the lines of the charts: load, and number of cells by placement."""
         counts = np.zeros((len(self._placements), len(self._grid)))
         for one in self._members:
             codes = self._codes(one)
@@ -162,35 +171,45 @@ class RecordedFleet:
         }
 
     def _codes(self, one: _Member) -> NDArray[np.int64]:
-        """Return the places of a cell's candidates among the placements; -1 of those not used."""
+        """Return the index of each candidate in the placements; -1 for unused candidates."""
         return np.array([self._placements.get(name, -1) for name in one.problem.candidates])
 
-    def _all_events(self) -> Iterator[Plain]:
-        """Yield what happened to the cells: their moves and refusals, and to how many what else."""
+    def _met(self, one: _Member) -> Scenario:
+        """Return the disturbances of a cell, with the sampled times of episodes."""
+        planned = one.problem.scenario(self._run.fleet.cells[one.place].entry.scenario)
+        return disturbances_met(self._run.cells[one.name], planned)
+
+    def _all_bands(self, met: list[Scenario]) -> list[tuple[float, float]]:
+        """Return the periods in which any cell is disturbed."""
+        bands: set[Band] = set()
+        for scenario in met:
+            bands.update(bands_of(scenario, float, self._end))
+        return merged(sorted(bands))
+
+    def _all_events(self, met: list[Scenario]) -> Iterator[Plain]:
+        """Yield moves and refusals by cell, and disturbances with the number of cells."""
         happened: Counter[tuple[float, str]] = Counter()
-        for one in self._members:
+        for one, scenario in zip(self._members, met, strict=True):
             for (_, text), events in groupby(
                 one.windows.events(), lambda one: (one["kind"], one["text"])
             ):
                 first, *again = events
                 times = f" ({len(again) + 1} times)" if again else ""
                 yield {**first, "text": f"{one.name}: {text}{times}"}
-            planned = one.problem.scenario(self._run.fleet.cells[one.place].entry.scenario)
-            met = disturbances_met(self._run.cells[one.name], planned)
-            for event in disturbance_events(met, one.problem, self._end):
+            for event in disturbance_events(scenario, one.problem, self._end):
                 happened[event["at"], event["text"]] += 1
         for (at, text), count in happened.items():
             who = "all cells" if count == len(self._members) else f"{count} of the cells"
             yield {"at": at, "kind": "disturbance", "text": f"{who}: {text}"}
 
     def _open(self, place: int) -> RecordedCell:
-        """Return a cell by its place in the fleet's file, with its cycles."""
+        """Open a cell with its cycles, by its index in the fleet's file."""
         return RecordedCell(self.folder / self._run.fleet.cells[place].name)
 
-    # --------------------------------------------------------------------- what is shown
+    # --------------------------------------------------------------------- showing
 
     def described(self) -> Plain:
-        """Return what does not change: its cells, and where its time line begins and ends."""
+        """Return the constant data: the cells, and the begin and end of the time line."""
         run, first = self._run, self._run.fleet.entries[0].cell
         phases = run.fleet.phases
         return {
@@ -214,13 +233,18 @@ class RecordedFleet:
             "placements": [{"name": name, "hue": self._hues[name]} for name in self._placements],
             "shared": list(self._load),
             "has_phi": bool(len(self._rounds.at)),
-            "mean_rate": plain(np.array([np.mean([one.rate for one in self._members])]), 4)[0],
+            "mean_rate": _known(np.mean([one.rate for one in self._members])),
+            "worst": self._members[0].windows.worst(),
+            "disturbed": self._bands,
+            "verdicts": dict(Counter(one.verdict for one in self._members if one.verdict)),
+            "aim": AIM,
             "cells": [
                 {
                     "place": one.place,
                     "name": one.name,
                     "deadline_ms": one.problem.pipeline.deadline_ms,
-                    "rate": plain(np.array([one.rate]), 4)[0],
+                    "rate": _known(one.rate),
+                    "verdict": one.verdict,
                 }
                 for one in self._members
             ],
@@ -233,7 +257,7 @@ class RecordedFleet:
         yield from listed(self._faults)
 
     def view(self, begin: float, end: float, bins: int) -> Plain:
-        """Return what is drawn between two places; all cells together have `MOST_BINS` bins."""
+        """Return the data of the charts between two places."""
         each = max(min(bins, MOST_BINS // len(self._members)), LEAST_BINS)
         return {
             "begin": begin,
@@ -256,7 +280,7 @@ class RecordedFleet:
         }
 
     def state(self, at: float) -> Plain:
-        """Return how the cells were at a place, and the load of the shared nodes."""
+        """Return the states of the cells at a place, and the load of the shared nodes."""
         cells = [self._cell_state(one, at) for one in self._members]
         unwell = sum(cell["health"] == "degraded" for cell in cells)
         health = "degraded" if unwell else "ok"
@@ -308,17 +332,23 @@ def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
     )
     counted = windows.rates[windows.counts]
     rate = float(counted.mean()) if len(counted) else np.nan
-    return _Member(place, cell.name, cell.problem, windows, rate, strip)
+    verdict = verdict_of(run, cell.problem, rate).word if len(counted) else None
+    return _Member(place, cell.name, cell.problem, windows, rate, verdict, strip)
+
+
+def _known(value: Any) -> float | None:
+    """Return a number for JSON; None for NaN and infinity."""
+    return float(value) if np.isfinite(value) else None
 
 
 def _held(windows: RecordedWindows, at: Any) -> NDArray[np.intp]:
-    """Return the window that each of some places is in; the first before it, the last after."""
+    """Return the index of the window at each place; before the first window, the first."""
     rows: NDArray[np.intp] = np.searchsorted(windows.opens, at, "right") - 1
     return np.maximum(rows, 0)
 
 
 def _rounds(members: list[_Member]) -> _Rounds:
-    """Return Φ where the ledger was asked; a move that it refused changes nothing."""
+    """Return Φ at each request to the ledger; a refused move leaves Φ as it was."""
     at, phi, number = [np.zeros(0)], [np.zeros((0, 2))], [np.zeros(0, np.int64)]
     for one in members:
         table = one.windows.decisions

@@ -13,41 +13,44 @@ from dwell.dash.strip import plain
 from dwell.model import Problem
 from dwell.model.live import RECENT_WINDOWS
 from dwell.model.number_arrays import Floats
-from dwell.record import Names, Run
+from dwell.record import Names, Run, shown_reason
 from dwell.record.moves import GUARD, by_guard
 
-#: What is both estimated and seen of a window, and the columns that say what was seen.
+#: Columns of the measured values by the names of their estimates.
 SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
+#: Explanation of the reason of a move to the least bad of all candidates.
+INFEASIBLE = "all candidates are over a cap, this one least"
 
 
 class RecordedWindows:
-    """See the module.
+    """Windows and decisions of a recorded run, on a time line.
 
     Parameters
     ----------
     opens : callable
-        From the numbers of their first cycles to where windows begin.
+        Converts numbers of first cycles to the places where their windows begin.
     length : float
-        Of a window.
+        Length of a window, in the unit of the time line.
 
     Attributes
     ----------
     number : int64 array, shape (n,)
-        Of the windows.
+        Numbers of the windows.
     opens, closes : float64 array, shape (n,)
-        Where they begin and end.
+        Places where the windows begin and end.
     rates : float64 array, shape (n,)
-        V_D, as it came to be.
+        Final V_D of each window.
     counts : bool array, shape (n,)
         Whether the window is after the warm-up.
     placement : int32 array, shape (n,)
-        Places of their placements among the cell's candidates.
+        Index of each window's placement in the cell's candidates.
     decisions : TableArrays
-        All of them.
+        All decisions, including moves of the guard.
     window_of : integer array, shape (decisions,)
-        Place of each one's window; -1 where that is missing.
+        Index of each decision's window; -1 if the window is missing.
     seen, used, costs : dict of str to float64 array, shape (n,)
-        What the close saw; utilisation by resource; J by candidate, NaN where none was known.
+        Values measured at the end of the window; utilisation by resource; J by candidate, NaN if
+        unknown.
     """
 
     def __init__(
@@ -74,7 +77,7 @@ class RecordedWindows:
         self._decide(run)
 
     def _decide(self, run: Run) -> None:
-        """Take in the decisions: those at a window's close, by window, and all of them."""
+        """Read the decisions, and index the decisions at the end of a window by window."""
         self.decisions = table = run.arrays("decisions")
         windows, reasons = table["window"].astype(np.int64), table.names("reason")
         self._reasons = reasons.to_list()
@@ -83,9 +86,9 @@ class RecordedWindows:
         refused = run.decisions["refused"].to_list() if "refused" in table else []
         self._refused = [text or "" for text in refused] or [""] * len(self._reasons)
         at_close = ~by_guard(table)
-        # Of a window, the row of its decision; -1 where nothing was decided.
+        # Row of each window's decision; -1 without a decision.
         self._row = np.full(len(self.number), -1)
-        # The place of its window; one that is missing has none.
+        # Index of each decision's window; decisions of missing windows get -1.
         places = np.searchsorted(self.number, windows)
         known = np.isin(windows, self.number)
         self.window_of = np.where(known, places, -1)
@@ -97,7 +100,7 @@ class RecordedWindows:
         }
 
     def _by_window(self, column: Floats) -> Floats:
-        """Return a column of the decisions by window; NaN where nothing was decided."""
+        """Return a column of the decisions by window; NaN without a decision."""
         values = np.full(len(self._row), np.nan)
         known = self._row >= 0
         values[known] = column[self._row[known]]
@@ -111,7 +114,7 @@ class RecordedWindows:
             place = int(self.window_of[row])
             if place < 0:
                 continue
-            reason = self._reasons[row]
+            reason = shown_reason(self._reasons[row])
             beyond = int(self.decisions["last_cycle"][row]) + 1 - int(self._first[place])
             at = float(self.opens[place]) + beyond * self._cycle
             names = [self._candidates[code[row]] for code in (self._incumbent, self._target)]
@@ -120,19 +123,33 @@ class RecordedWindows:
                 yield {**event, "kind": "refused", "text": f"{reason}: {self._refused[row]}"}
             else:
                 kind = "guard" if reason == GUARD else "move"
-                yield {**event, "kind": kind, "text": f"{names[0]} → {names[1]}: {reason}"}
+                why = f"{reason} ({INFEASIBLE})" if reason == "infeasible" else reason
+                yield {**event, "kind": kind, "text": f"{names[0]} → {names[1]}: {why}"}
+
+    def worst(self) -> Plain | None:
+        """Return the window with the largest V_D after the warm-up, then with the largest L95."""
+        rows = np.flatnonzero(self.counts)
+        if not len(rows):
+            return None
+        keys = (-np.nan_to_num(self.seen["l95_ms"][rows]), -self.rates[rows])
+        row = int(rows[np.lexsort(keys)[0]])
+        return {
+            "number": int(self.number[row]),
+            "at": float(self.closes[row]),
+            "rate": float(self.rates[row]),
+        }
 
     def closed(self, at: float) -> int:
-        """Return which window was the last to close before a place; -1 where none was."""
+        """Return the index of the last window that ended up to a place; -1 before the first."""
         return int(np.searchsorted(self.closes, at, "right")) - 1
 
     def health(self, k: int) -> Plain:
-        """Return health and headline when the k-th window was the last to have closed."""
+        """Return health and headline at the end of the k-th window."""
         recent = self.rates[max(k + 1 - RECENT_WINDOWS, 0) : k + 1]
         return dict(health_by(self._problem, recent.tolist()))
 
     def window(self, k: int) -> Plain:
-        """Return the k-th window, and what was decided on it."""
+        """Return the k-th window and the decision at its end."""
         row = int(self._row[k])
         return {
             "window": {
@@ -146,7 +163,7 @@ class RecordedWindows:
         }
 
     def estimates(self, k: int) -> Plain:
-        """Return what was predicted of the k-th window, and what was estimated at its close."""
+        """Return the prediction for the k-th window, its load and the estimates at its end."""
         before, row = int(self._row[k - 1]) if k > 0 else -1, int(self._row[k])
         placement = self._candidates[self.placement[k]]
         names = () if row < 0 else self._candidates
@@ -166,7 +183,7 @@ class RecordedWindows:
         }
 
     def _estimate(self, row: int, name: str) -> Plain:
-        """Return what a decision believed of a candidate: cost, L95, V_D, whether it is in caps."""
+        """Return the estimates of a candidate at a decision; `eligible` means within all caps."""
         columns = (f"j_{name}", f"est_l95_ms_{name}", f"est_violation_rate_{name}")
         values = self._numbers(row, *columns)
         within = bool(self.decisions[f"eligible_{name}"][row])
@@ -174,7 +191,7 @@ class RecordedWindows:
         return {**dict(found), "eligible": within}
 
     def _numbers(self, row: int, *columns: str) -> Plain:
-        """Return values of a decision; None where there is none."""
+        """Return values of a decision by column; None if unknown."""
         rows = slice(row, row + 1)
         return {
             name: plain(self.decisions[name][rows].astype(np.float64), 4)[0] for name in columns
@@ -182,7 +199,7 @@ class RecordedWindows:
 
 
 def placement_codes(names: Names, candidates: Sequence[str]) -> NDArray[np.int32]:
-    """Return names as places among candidates; -1 for one that is none of them."""
+    """Return the index of each name in the candidates; -1 for other names."""
     place = {name: i for i, name in enumerate(candidates)}
     codes = np.array([place.get(name, -1) for name in names.known] or [-1], np.int32)
     found: NDArray[Any] = codes[names.places] if len(names.places) else codes[:0]

@@ -124,7 +124,7 @@ class CellRecorder:
             self.dropped += 1
             if self._trouble != (trouble := str(error.strerror)):
                 self._say(
-                    f"error: {self._path}: cannot be written ({trouble}); what is heard is dropped"
+                    f"error: {self._path}: cannot be written ({trouble}); new rows are dropped"
                 )
             self._trouble = trouble
             return

@@ -1,4 +1,4 @@
-"""The page's application: what it serves of its cells, and how people act on them."""
+"""Web application of the page: data of its cells, and commands of the user."""
 
 from __future__ import annotations
 
@@ -28,6 +28,7 @@ from dwell.errors import DwellError
 
 if TYPE_CHECKING:
     from dwell.dash.recorded_fleet import RecordedFleet
+    from dwell.dash.runs_folder import RunsFolder
 
 _LOG = logging.getLogger(__name__)
 
@@ -38,49 +39,56 @@ TYPES = {
     ".js": "text/javascript; charset=utf-8",
     ".svg": "image/svg+xml",
 }
-#: Time between two looks at cells that run while somebody reads, and at all cells otherwise.
+#: Period of reading the cells: while a page of a live cell is open, and otherwise.
 TICK_S, IDLE_TICK_S = 0.1, 1.0
-#: Readers of events at a time, and how long one may take for one of them.
+#: Largest number of open pages, and the longest time to send one event to a page.
 MOST_READERS, READER_S = 32, 10.0
-#: A comment keeps a connection, and notices who is gone.
+#: Time without events after which a comment is sent, to keep and check the connection.
 QUIET_S = 15.0
 MOST_BODY_BYTES = 4_096
-#: Number of a cell, as a request has it.
+#: Number of a cell in a request.
 PLACE = re.compile(r"[0-9]{1,6}")
 LEAST_BINS, MOST_BINS = 10, 1_500
 
-#: Name of an act, and what it is about, to the controller's status.
+#: Sends a command, by its name and argument; returns the controller's status.
 Act: TypeAlias = Callable[[str, str], Mapping[str, Any]]
 
-#: What acts, and what the body of the request says that it is about.
+#: Commands, and the key of their argument in the body of the request.
 ACTS = {"pin": "candidate", "unpin": None, "drain": "node", "undrain": "node"}
 
 
 @dataclass(slots=True)
 class Dash:
-    """Cells on one page, or a fleet whose cells have a page each.
+    """Cells on one page, or a fleet or a folder of runs with one page per cell or run.
 
     Parameters
     ----------
     cells : sequence of PagedCell
-        On one time line.
+        Cells on one time line.
     fleet : RecordedFleet, optional
-        Shown instead of them.
+        Shown instead of `cells`.
+    runs : RunsFolder, optional
+        Listed instead of `cells`.
     line : str
-        What the time line counts where there are several, and why; empty for one.
+        Unit of the time line of two runs, and its reason; empty for one run.
     act : callable, optional
-        What carries out acts on the first cell; the page is read-only without.
+        Sends commands to the first cell; without it the page is read-only.
     read_only : str
-        Why it is.
+        Reason why the page is read-only.
+    difference : callable, optional
+        Computes V_D of the second cell minus V_D of the first between two places, in bins; its
+        arguments are begin, end and the largest number of bins.
     metrics : callable, optional
-        From the header `Accept` to the page of the first cell's metrics, and its type.
+        Returns the metrics of the first cell and their MIME type, by the header `Accept`.
     """
 
     cells: Sequence[PagedCell] = ()
     fleet: RecordedFleet | None = None
+    runs: RunsFolder | None = None
     line: str = ""
     act: Act | None = None
-    read_only: str = "this page only looks; `dwell dash --control` lets it act"
+    read_only: str = "this page is read-only; `dwell dash --control` allows commands"
+    difference: Callable[[float, float, int], Plain] | None = None
     metrics: Callable[[str], tuple[bytes, str]] | None = None
     _news: asyncio.Condition = field(default_factory=asyncio.Condition, repr=False)
     _tick: tuple[int, bytes] = field(default=(0, b""), repr=False)
@@ -88,13 +96,16 @@ class Dash:
     _over: bool = field(default=False, repr=False)
 
     def application(self) -> Starlette:
-        """Return what a server serves; who may ask is not its business (`dwell.dash.gate`)."""
+        """Return the ASGI application; `dwell.dash.gate` controls the access to it."""
         routes = [
             *(Route(path, partial(_file, "index.html")) for path in ("/", "/cell/{place:int}")),
             *(Route(f"/static/{name}", partial(_file, name)) for name in static_files()),
             Route("/cells", self._cells),
+            Route("/runs", self._runs),
+            Route("/lines", self._lines),
             Route("/view", self._view),
             Route("/state", self._state),
+            Route("/difference", self._difference),
             Route("/jobs", self._jobs),
             Route("/events", self._events),
             Route("/metrics", self._metrics),
@@ -107,11 +118,15 @@ class Dash:
         app.router.redirect_slashes = False
         return app
 
-    # ---------------------------------------------------------------------- what is read
+    # ---------------------------------------------------------------------- data
 
     async def _cells(self, request: Request) -> Response:
-        fleet = None
-        if self.fleet is None:
+        fleet = runs = None
+        cells: Sequence[PagedCell]
+        if self.runs is not None:
+            cells = [await self._cell(request)] if "cell" in request.query_params else []
+            runs = {"name": self.runs.name} if cells else self.runs.described()
+        elif self.fleet is None:
             cells = self.cells
         elif "cell" in request.query_params:
             cells = [await self._cell(request)]
@@ -124,17 +139,39 @@ class Dash:
             {
                 "cells": [await run_in_threadpool(cell.described) for cell in cells],
                 "fleet": fleet,
+                "runs": runs,
                 "line": self.line,
+                "difference": self.difference is not None,
                 "control": control,
                 "read_only": None if control else self.read_only,
             }
         )
 
+    async def _runs(self, request: Request) -> Response:
+        runs, since = self._folder(), _number(request, "since", 0.0)
+        return JSONResponse(runs.rows(max(int(since), 0)))
+
+    async def _lines(self, request: Request) -> Response:
+        runs, named = self._folder(), request.query_params.get("cells", "").split(",")
+        places = [int(name) for name in named if PLACE.fullmatch(name)]
+        if len(places) != len(named) or max(places) >= runs.count:
+            raise HTTPException(HTTPStatus.BAD_REQUEST, "cells must be numbers of runs")
+        return JSONResponse(await run_in_threadpool(runs.lines, places))
+
+    def _folder(self) -> RunsFolder:
+        if self.runs is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this page lists no runs")
+        return self.runs
+
     async def _view(self, request: Request) -> Response:
         shown, begin, end = await self._shown(request), *_places(request)
-        bins = round(_number(request, "bins", 600.0))
-        bins = min(max(bins, LEAST_BINS), MOST_BINS)
-        return JSONResponse(await run_in_threadpool(shown.view, begin, end, bins))
+        return JSONResponse(await run_in_threadpool(shown.view, begin, end, _bins(request)))
+
+    async def _difference(self, request: Request) -> Response:
+        if self.difference is None:
+            raise HTTPException(HTTPStatus.NOT_FOUND, "this page does not compare two runs")
+        begin, end = _places(request)
+        return JSONResponse(await run_in_threadpool(self.difference, begin, end, _bins(request)))
 
     async def _state(self, request: Request) -> Response:
         shown = await self._shown(request)
@@ -145,7 +182,7 @@ class Dash:
         return JSONResponse(await run_in_threadpool(cell.jobs, begin, end))
 
     async def _shown(self, request: Request) -> PagedCell | RecordedFleet:
-        """Return the cell that a request names; the fleet where it names none."""
+        """Return the cell in a request; without its number, the fleet if the page has one."""
         if self.fleet is not None and "cell" not in request.query_params:
             return self.fleet
         return await self._cell(request)
@@ -153,14 +190,15 @@ class Dash:
     async def _cell(self, request: Request) -> PagedCell:
         name = request.query_params.get("cell", "0")
         place = int(name) if PLACE.fullmatch(name) else -1
-        if self.fleet is not None and 0 <= place < self.fleet.count:
-            return await run_in_threadpool(self.fleet.cell, place)
-        if self.fleet is None and 0 <= place < len(self.cells):
+        several = self.fleet or self.runs
+        if several is not None and 0 <= place < several.count:
+            return await run_in_threadpool(several.cell, place)
+        if several is None and 0 <= place < len(self.cells):
             return self.cells[place]
         raise HTTPException(HTTPStatus.NOT_FOUND, f"no cell {name[:20]!r}")
 
     async def _ready(self, _: Request) -> Response:
-        """Whether a live cell is heard, and well; says nothing else of it."""
+        """Answer whether the live cells are healthy; the answer has no other data."""
         live = [cell for cell in self.cells if cell.live]
         states = [await run_in_threadpool(cell.state, 0.0) for cell in live]
         well = bool(states) and all(state.get("health") == "ok" for state in states)
@@ -174,7 +212,7 @@ class Dash:
         page, content_type = await run_in_threadpool(self.metrics, accept)
         return Response(page, headers={"content-type": content_type})
 
-    # ------------------------------------------------------------------------- what acts
+    # ------------------------------------------------------------------------- commands
 
     async def _act(self, what: str, request: Request) -> Response:
         if self.act is None:
@@ -185,7 +223,7 @@ class Dash:
         shown = ("pinned", "drained", "placement", "moving_to")
         return JSONResponse({name: status.get(name) for name in shown})
 
-    # ------------------------------------------------------------------------- what is new
+    # ------------------------------------------------------------------------- events
 
     @asynccontextmanager
     async def _ticking(self, _: Starlette) -> AsyncIterator[None]:
@@ -198,7 +236,7 @@ class Dash:
                 await task
 
     async def _look_on(self) -> None:
-        """Tell all readers of events together what is new; nobody is waited for."""
+        """Read the cells periodically; send their new states to all open pages, without waiting."""
         live = any(cell.live for cell in self.cells)
         clock = asyncio.get_running_loop().time
         looked_s = clock()
@@ -210,8 +248,8 @@ class Dash:
                 news = await run_in_threadpool(self._new_states)
                 data = f"data: {json.dumps(news, allow_nan=False)}\n\n".encode()
             except Exception:
-                # The next look may be better; a page without news says that it has none.
-                _LOG.exception("the page's cells cannot be looked at")
+                # The next reading may succeed; without events, a page shows that its data are old.
+                _LOG.exception("the page's cells cannot be read")
                 continue
             if news and self._readers:
                 async with self._news:
@@ -219,7 +257,7 @@ class Dash:
                     self._news.notify_all()
 
     def _new_states(self) -> list[Plain]:
-        """Return the state of every live cell, and where the recorded ones that grew end."""
+        """Return the state of each live cell, and the constant data of recorded cells that grew."""
         news = []
         for place, cell in enumerate(self.cells):
             grew = cell.refreshed()
@@ -237,7 +275,7 @@ class Dash:
         return _EventStream(self)
 
     async def next_tick(self, number: int) -> tuple[int, bytes] | None:
-        """Return the newest tick after a number, or a comment after a while; None at the end."""
+        """Return the newest tick after `number`, or a comment after `QUIET_S`; None at the end."""
         async with self._news:
             with suppress(TimeoutError):
                 await asyncio.wait_for(
@@ -247,14 +285,14 @@ class Dash:
         return number, b": quiet\n\n"
 
     async def close(self) -> None:
-        """Let all readers of events go."""
+        """End all event streams."""
         async with self._news:
             self._over = True
             self._news.notify_all()
 
     @asynccontextmanager
     async def reading(self) -> AsyncIterator[None]:
-        """Count a reader of events."""
+        """Count an event stream while it is open."""
         self._readers += 1
         try:
             yield
@@ -263,7 +301,7 @@ class Dash:
 
 
 class _EventStream(Response):
-    """Server-sent events to one reader: the newest; one that does not read is let go."""
+    """Server-sent events to one page: only the newest; a page that does not read is dropped."""
 
     def __init__(self, dash: Dash) -> None:
         super().__init__()
@@ -292,14 +330,14 @@ class _EventStream(Response):
 
 
 async def _gone(receive: Receive) -> None:
-    """Wait until a reader is gone."""
+    """Wait until the client disconnects."""
     while (await receive())["type"] != "http.disconnect":
         pass
 
 
 @cache
 def static_files() -> Mapping[str, bytes]:
-    """Return all files that are served, by their paths: nothing else of the disk is ever read."""
+    """Return the contents of all served files by path; requests read no other file."""
     files = (path for path in STATIC.rglob("*") if path.suffix in TYPES)
     return {path.relative_to(STATIC).as_posix(): path.read_bytes() for path in files}
 
@@ -322,7 +360,7 @@ async def _failed(_: Request, error: Exception) -> Response:
 
 
 async def _about(request: Request, key: str) -> str:
-    """Return what an act is about, from the request's body."""
+    """Return the argument of a command from the request's body."""
     body = b""
     async for chunk in request.stream():
         body += chunk
@@ -335,7 +373,7 @@ async def _about(request: Request, key: str) -> str:
     except (ValueError, KeyError, TypeError, RecursionError):
         about = None
     if not isinstance(about, str):
-        raise HTTPException(HTTPStatus.BAD_REQUEST, f'the body has to be {{"{key}": NAME}}')
+        raise HTTPException(HTTPStatus.BAD_REQUEST, f'the body must be {{"{key}": NAME}}')
     return about
 
 
@@ -344,6 +382,10 @@ def _places(request: Request) -> tuple[float, float]:
     if not begin < end:
         raise HTTPException(HTTPStatus.BAD_REQUEST, f"begin {begin:g} is not before end {end:g}")
     return begin, end
+
+
+def _bins(request: Request) -> int:
+    return min(max(round(_number(request, "bins", 600.0)), LEAST_BINS), MOST_BINS)
 
 
 def _number(request: Request, name: str, usual: float | None = None) -> float:
@@ -355,5 +397,5 @@ def _number(request: Request, name: str, usual: float | None = None) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise HTTPException(HTTPStatus.BAD_REQUEST, f"{name} has to be a number, not {text!r}")
+        raise HTTPException(HTTPStatus.BAD_REQUEST, f"{name} must be a number, not {text!r}")
     return value

@@ -71,10 +71,8 @@ def _listening(port: int) -> Iterator[socket.socket]:
     try:
         listener = socket.create_server((LOOPBACK, port), backlog=MOST_CONNECTIONS)
     except OSError as error:
-        why = "is taken" if error.errno == errno.EADDRINUSE else f"cannot be had ({error.strerror})"
-        raise DwellError(
-            f"port {port} of {LOOPBACK} {why}; --port 0 takes one that is free"
-        ) from None
+        why = "is taken" if error.errno == errno.EADDRINUSE else f"fails ({error.strerror})"
+        raise DwellError(f"port {port} of {LOOPBACK} {why}; --port 0 takes a free port") from None
     with listener:
         yield listener
 

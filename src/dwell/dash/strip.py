@@ -116,6 +116,39 @@ class Strip:
         }
 
 
+def difference_of_misses(
+    one: Strip, other: Strip, begin: float, end: float, bins: int, length: float
+) -> dict[str, Any]:
+    """Return the share of missed cycles in one strip less the share in another, per bin.
+
+    Parameters
+    ----------
+    bins : int
+        Most bins; each is a whole number of windows.
+    length : float
+        Length of a window.
+
+    Returns
+    -------
+    dict
+        ``begin``, ``end`` of each bin and ``points`` of per cent; None if a strip has no cycle in
+        the bin.
+    """
+    step = length * max(1, -(-(end - begin) // (length * bins)))
+    edges = np.arange(begin // step, -(-end // step) + 1) * step
+    shares = []
+    for strip in (one, other):
+        rows = np.searchsorted(strip.at, edges)
+        missed = np.concatenate(([0], np.cumsum(strip.missed)))[rows]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            shares.append(np.diff(missed) / np.diff(rows))
+    return {
+        "begin": plain(edges[:-1], 4),
+        "end": plain(edges[1:], 4),
+        "points": plain(100 * (shares[0] - shares[1]), 3),
+    }
+
+
 def bin_starts(at: Floats, begin: float, end: float, bins: int) -> NDArray[np.intp]:
     """Return the first row of each bin with rows; one bin per row if rows are at most `bins`."""
     if len(at) <= bins:

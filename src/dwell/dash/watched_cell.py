@@ -1,4 +1,4 @@
-"""WatchedCell: a live cell as the page sees it, by what its observer hears."""
+"""WatchedCell: a live cell on the page, from the messages that its observer receives."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from dwell.dash.strip import Strip, binned_means
 from dwell.model.number_arrays import Floats
 from dwell.record.json_documents import json_ready
 
-#: Cycles of the time line, which reaches farther back than the observer.
+#: Largest number of cycles on the time line; the observer keeps fewer.
 MOST_CYCLES = 40_000
-#: Parts of a controller's status that the page shows as they are.
+#: Entries of the controller's status that the page shows unchanged.
 SHOWN = (
     *("health", "headline", "mode", "fallback", "moving_to", "proving", "pinned", "drained"),
     *("migrations", "guard_moves", "unproven", "bound_ms", "silences", "release_ratio"),
@@ -25,7 +25,7 @@ SHOWN = (
 
 
 class WatchedCell:
-    """See the module and `PagedCell`; its time line counts seconds."""
+    """A live cell on the page (see `PagedCell`); its time line counts seconds."""
 
     live = True
 
@@ -36,12 +36,12 @@ class WatchedCell:
         self._strip, self._cycles_upto = self._strip_of(()), 0
         self._windows: list[ObservedWindow] = []
         self._windows_upto = -1
-        # When the windows closed, and their values: what is drawn as lines.
+        # Ends of the windows and columns of their values, for the line charts.
         self._lines: tuple[Floats, dict[str, Floats]] = (np.zeros(0), {})
         self._told = (0, 0, 0)
 
     def _take(self) -> Strip:
-        """Take in what the observer has heard since."""
+        """Take the new cycles and windows from the observer; return the cycles."""
         observer = self.observer
         with self._taking:
             news = observer.cycles.since(self._cycles_upto)
@@ -111,7 +111,7 @@ class WatchedCell:
         }
 
     def state(self, at: float) -> Plain:
-        """See `PagedCell`; it is the present, whatever the place."""
+        """See `PagedCell`; always the current state."""
         now = self.observer.now()
         status, window = now.status, now.status.get("window") or {}
         ages_ms = [sink["applied_age_ms"] for sink in (status.get("sinks") or {}).values()]
@@ -120,7 +120,7 @@ class WatchedCell:
             "cycle": self._strip.number[-1].item() if len(self._strip.number) else None,
             "placement": now.placement or None,
             "answer_age_ms": None if now.answer_age_s is None else round(now.answer_age_s * 1e3),
-            # The oldest age of a sink's last applied command.
+            # Largest age of the last applied command over the sinks.
             "age_ms": None if not ages_ms or None in ages_ms else max(ages_ms),
             "cycles": dict(now.cycles),
             "missed": now.missed,
@@ -169,7 +169,7 @@ class WatchedCell:
         return jobs_document(cycles, (job for one in mine for job in one.jobs))
 
     def refreshed(self) -> bool:
-        """See `PagedCell`; cycles are taken in meanwhile, before the observer lets go of them."""
+        """See `PagedCell`; it takes the cycles before they leave the observer's feed."""
         self._take()
         observer = self.observer
         told = observer.cycles.upto, observer.windows.upto, observer.events.upto
@@ -178,12 +178,12 @@ class WatchedCell:
 
 
 def _estimate(window: Mapping[str, Any], name: str) -> Plain:
-    """Return what was believed of a candidate at a window's close."""
+    """Return the estimates of a candidate at the end of a window."""
     return {"cost": window["estimates"].get(name), **window.get("predicted", {}).get(name, {})}
 
 
 def _processes(status: Mapping[str, Any]) -> list[Plain]:
-    """Return who was ever heard, who never was, and who is another's."""
+    """Return the processes: received at least once, never received, and not of this cell."""
     known = [{"who": who, **told} for who, told in (status.get("processes") or {}).items()]
     silent = [{"who": who, "heard": False} for who in status.get("silent") or ()]
     strangers = [

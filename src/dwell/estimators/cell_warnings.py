@@ -1,7 +1,7 @@
-"""Settings of a cell that are allowed and seldom meant.
+"""Warnings about settings of a cell that are valid but seldom intended.
 
-`warnings_of` judges a cell by itself, without anything played, and `unplayed` a scenario by the
-length of a run. Each says which setting it is, and what to do about it.
+`warnings_of` checks a cell; `unplayed` and `unpriced` check a scenario against the length of a run
+and of the simulations for prices. Each warning names the setting and a remedy.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from dwell.model.process import Process, Trace
 from dwell.model.scenario import LinkDisturbance, NodeDisturbance, acts
 from dwell.model.servo import Servo
 
-#: Draws of a process that a percentile, or a mean of latencies, is taken of.
+#: Samples of a process for a percentile or a smallest value.
 DRAWS = 10_000
-#: Share of an accelerator from which on its jobs wait for each other often.
+#: Share of an accelerator above which its jobs often wait for each other.
 NEARLY_FULL = 0.9
-#: Share of J from which on one term leaves nothing to the others.
+#: Share of J above which a term makes all others negligible.
 DOMINANT = 0.95
 #: Rate above which a file probably gives bits per second, Mbit/s.
 FASTEST_MBPS = 1e6
@@ -42,7 +42,7 @@ LONGEST_STEP, LONGEST_SPAN = 1_000, 1_000_000
 
 
 def warnings_of(problem: Problem) -> Iterator[Fault]:
-    """Yield what is allowed in a cell but seldom meant."""
+    """Yield a warning for each setting of a cell that is valid but seldom intended."""
     profile = Profile(problem)
     for name, placement in problem.candidates.items():
         messages = chain(
@@ -68,7 +68,7 @@ def warnings_of(problem: Problem) -> Iterator[Fault]:
 
 
 def unplayed(problem: Problem, scenario: str, windows: int) -> Iterator[Fault]:
-    """Yield a warning where nothing of a scenario falls into the windows of a run that count."""
+    """Yield a warning if no disturbance of a scenario affects the counted windows of a run."""
     items = problem.scenario(scenario)
     window_s = problem.window_ms / 1e3
     begin_s, end_s = problem.warmup_windows * window_s, windows * window_s
@@ -84,7 +84,7 @@ def unplayed(problem: Problem, scenario: str, windows: int) -> Iterator[Fault]:
 
 
 def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
-    """Yield a warning if prices simulate less than a scenario needs to show all it does."""
+    """Yield a warning if the simulations for prices are too short for a scenario."""
     until_s = cycles * problem.pipeline.period_ms / 1e3
     for item in problem.scenario(scenario):
         if item.at_s >= until_s or until_s < item.end_s < math.inf:
@@ -102,7 +102,7 @@ def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
 
 
 def _overloads(problem: Problem, placement: Placement) -> Iterator[str]:
-    """Yield where own work is more than a node can do, or than an accelerator nearly."""
+    """Yield nodes that own work overloads, and accelerators that it nearly fills."""
     for name, share in _own_shares(problem, placement).items():
         resource = problem.fabric.resources[name]
         node, kind = problem.fabric.nodes[resource.node], resource.kind
@@ -124,7 +124,7 @@ def _overloads(problem: Problem, placement: Placement) -> Iterator[str]:
 
 
 def _limit_and_remedy(node: Node, left: float) -> tuple[str, str]:
-    """Return the limit on the own work on a node, and how to raise it, as messages have them."""
+    """Return the limit of the own work on a node and the remedy, as parts of a message."""
     limit, remedy = f"the cores of {node.name}", ", or give the node more cores"
     if node.quota is not None and node.quota.cpu < node.cores:
         limit = f"the quota of {node.name} ({node.quota.cpu:g} of {node.cores} cores)"
@@ -136,14 +136,14 @@ def _limit_and_remedy(node: Node, left: float) -> tuple[str, str]:
 
 
 def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Task, Execution]]:
-    """Return the stages that a placement has on the cores of a node."""
+    """Return the tasks that a placement has on the cores of a node."""
     tasks = [task for task in problem.pipeline.tasks.values() if placement[task.name] == node.name]
     both = [(task, task.on[node.name]) for task in tasks]
     return [(task, execution) for task, execution in both if execution.accelerator is None]
 
 
 def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
-    """Return the share of each resource's capacity that own work asks for."""
+    """Return the share of each resource's capacity that own work needs."""
     work_ms = dict.fromkeys(problem.fabric.resources, 0.0)
     for task in problem.pipeline.tasks.values():
         execution = task.on[placement[task.name]]
@@ -158,11 +158,11 @@ def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
 
 
 def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
-    """Share of a node's capacity that background and bursts leave to its own work at most."""
+    """Return the largest share of a node's capacity that background and bursts leave free."""
     left, bursts = 1 - node.background / node.capacity, node.bursts
     if bursts is None or bursts.threads == 0:
         return left
-    # All that its workers can have running beside the bursts; others than `fair` give all cores.
+    # Most threads of own jobs at once; without `fair` own jobs may have all cores.
     threads = float(node.cores)
     if node.scheduler == "fair":
         on_cpu = _on_cpu(problem, node, placement)
@@ -172,7 +172,7 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
 
 
 def _slow_stages(problem: Problem, placement: Placement) -> Iterator[str]:
-    """Yield stages that take longer for a job than their workers have."""
+    """Yield tasks with too few workers for the time of their jobs."""
     period_ms, shares = problem.pipeline.period_ms, _own_shares(problem, placement)
     for task in problem.pipeline.tasks.values():
         node = problem.fabric.nodes[placement[task.name]]
@@ -189,7 +189,7 @@ def _slow_stages(problem: Problem, placement: Placement) -> Iterator[str]:
 
 
 class _Jobs(NamedTuple):
-    """Jobs of a task: the cores that each holds, how many may run at once, and their time, ms."""
+    """Jobs of a task: cores of each, most jobs at once, and time of each, milliseconds."""
 
     cores: int
     most: int
@@ -197,17 +197,17 @@ class _Jobs(NamedTuple):
 
 
 def _wide_jobs(problem: Problem, placement: Placement, node: Node, left: float) -> Iterator[str]:
-    """Yield a warning if jobs on a node cannot run side by side, and together take more than P."""
+    """Yield a warning if jobs take more than a period because they cannot all run at once."""
     period_ms, jobs, alone_ms = problem.pipeline.period_ms, {}, 0.0
     for task, execution in _on_cpu(problem, node, placement):
         cores = min(execution.threads, node.cores)
         ms = mean_ms(problem.pipeline, task, execution) * execution.threads / cores
         jobs[task.name] = _Jobs(cores, min(execution.workers, node.cores // cores), ms)
         alone_ms = max(alone_ms, ms / execution.workers)
-    # At least this share of the cycles arrives everywhere.
+    # At least this share of the cycles loses no message.
     dropping = (link for _, link in _crossings(problem, placement) if link.retransmit_ms is None)
     arriving = math.prod(1 - link.loss for link in dropping)
-    # The background of a node with a quota slows no job: it takes from the quota.
+    # Background load reduces a quota; without a quota it slows jobs down.
     speed = left if node.quota is None else 1.0
     needed_ms = _needed_ms([*jobs.values()], node.cores) * arriving / speed
     if alone_ms <= period_ms < needed_ms * (1 - 1e-9):
@@ -220,7 +220,7 @@ def _wide_jobs(problem: Problem, placement: Placement, node: Node, left: float) 
 
 
 def _needed_ms(jobs: Sequence[_Jobs], cores: int) -> float:
-    """Lower bound on the time that the jobs of a cycle take on a node that is not `fair`.
+    """Return a lower bound on the time that the jobs of a cycle take on a node without `fair`.
 
     Give each job a weight, equal for all jobs of a task. At any instant the running jobs hold no
     more than all cores, and at most `most` of them belong to one task. Let M be the largest sum of
@@ -285,7 +285,7 @@ def _crossings(problem: Problem, placement: Placement) -> Iterator[tuple[Flow, L
 
 
 def _full_links(problem: Problem, placement: Placement) -> Iterator[str]:
-    """Yield links over which more is sent than they carry, repetitions included."""
+    """Yield links that get more data than their rate allows, including repeated messages."""
     sent_bytes = dict.fromkeys(problem.fabric.links, 0.0)
     for flow, link in _crossings(problem, placement):
         attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
@@ -313,7 +313,7 @@ def _fast_links(problem: Problem) -> Iterator[Fault]:
 
 
 def _same_placements(problem: Problem) -> Iterator[Fault]:
-    """Yield candidates that are the placement of another one."""
+    """Yield candidates with the same placement as an earlier candidate."""
     for (first, one), (second, other) in combinations(problem.candidates.items(), 2):
         if one == other:
             yield Fault(
@@ -323,7 +323,7 @@ def _same_placements(problem: Problem) -> Iterator[Fault]:
 
 
 def _over_caps(problem: Problem, placement: Placement, l95_ms: float) -> Iterator[str]:
-    """Yield the caps that a candidate is over before anything disturbs it."""
+    """Yield the caps that a candidate exceeds without disturbances."""
     caps = problem.objective.caps
     never = "it is never eligible while another one is"
     if l95_ms > caps.latency_ms:
@@ -339,7 +339,7 @@ def _over_caps(problem: Problem, placement: Placement, l95_ms: float) -> Iterato
 
 
 def _percentages(problem: Problem) -> Iterator[Fault]:
-    """Yield shares above 1, as of who means percent."""
+    """Yield shares above 1 and quotas above all cores, which may be meant as percentages."""
     caps, targets = problem.objective.caps, problem.objective.targets
     shares = {
         "objective.caps.utilisation": caps.utilisation,
@@ -363,7 +363,7 @@ def _percentages(problem: Problem) -> Iterator[Fault]:
 
 
 def _dominant_terms(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield a term of J that leaves nothing to the others, whichever candidate is active."""
+    """Yield a term of J that makes all others negligible under every candidate."""
     objective = problem.objective
     terms = {name: _terms(objective, profile, name) for name in problem.candidates}
     weights = {term: getattr(objective.weights, term) or 0.0 for term in ("latency", *_OTHERS)}
@@ -372,7 +372,7 @@ def _dominant_terms(problem: Problem, profile: Profile) -> Iterator[Fault]:
         shares = [of[term] / sum(of.values()) for of in terms.values() if any(of.values())]
         if rest == 0 or len(shares) < len(terms) or min(shares) <= DOMINANT:
             continue
-        # Above what it is at its target in every candidate, or by its weight alone.
+        # The term is above its value at its target in every candidate, or its weight dominates.
         if min(of[term] for of in terms.values()) > weight or weight > DOMINANT * (weight + rest):
             target = (
                 "" if term == "violations" else f", or raise targets.{_TARGETS.get(term, term)}"
@@ -389,7 +389,7 @@ _TARGETS = {"latency": "latency_ms"}
 
 
 def _terms(objective: Objective, profile: Profile, candidate: str) -> dict[str, float]:
-    """Terms of J of a candidate as it is expected undisturbed, by their weights' names."""
+    """Return the expected terms of J of an undisturbed candidate, by the names of weights."""
     used = tier_utilisation(profile.own[candidate], objective)
     # One metric at a time, and 0 for the others.
     l95_ms, rate, robot, edge, cloud = np.diag(
@@ -403,10 +403,10 @@ def _terms(objective: Objective, profile: Profile, candidate: str) -> dict[str, 
 
 
 def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield candidates under which the guard would fire although nothing is wrong.
+    """Yield candidates under which the guard would fire without a fault.
 
-    It fires when the cycle after the newest completed one is older than `guard_cycles` periods,
-    under a fallback, too, unless it has moved the cell there just now.
+    The guard fires when the cycle after the newest completed cycle is older than `guard_cycles`
+    periods. It also fires under a fallback, except just after it has moved the cell there.
     """
     settings = problem.controller
     if not settings.fallbacks:
@@ -425,7 +425,7 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
 
 
 def _return_ms(problem: Problem, candidate: str) -> float:
-    """Longest mean delay from a sink's node back to a source's, where there is a link."""
+    """Return the longest mean delay of the links from a sink's node to a source's node, ms."""
     pipeline, placement = problem.pipeline, problem.candidates[candidate]
     sources = [placement[task] for task in pipeline.tasks if not pipeline.inputs(task)]
     sinks = [placement[task] for task in pipeline.tasks if not pipeline.outputs(task)]
@@ -435,7 +435,7 @@ def _return_ms(problem: Problem, candidate: str) -> float:
 
 
 def _helpless_fallbacks(problem: Problem) -> Iterator[Fault]:
-    """Yield nodes off the robots that every fallback needs, though the cell might do without."""
+    """Yield nodes outside the robots that all fallbacks use and no anchored task needs."""
     fallbacks = problem.controller.fallbacks
     if not fallbacks:
         return
@@ -455,7 +455,7 @@ def _helpless_fallbacks(problem: Problem) -> Iterator[Fault]:
 
 
 def _late_releases(problem: Problem) -> Iterator[Fault]:
-    """Yield a jitter of releases that exceeds the period: many then fall on the same instant."""
+    """Yield a release jitter longer than the period: many releases then coincide."""
     jitter, period_ms = problem.pipeline.release_jitter_ms, problem.pipeline.period_ms
     rng = np.random.default_rng(1)
     draws = jitter.values if isinstance(jitter, Trace) else jitter.marginal(rng, DRAWS)
@@ -470,14 +470,14 @@ def _late_releases(problem: Problem) -> Iterator[Fault]:
 
 
 def _odd_traces(problem: Problem) -> Iterator[Fault]:
-    """Yield traces by time whose instants are probably wrong, or in another unit."""
+    """Yield timed traces with instants that are probably wrong or in another unit."""
     period_ms = problem.pipeline.period_ms
     processes = chain.from_iterable(map(partial(processes_of, problem), problem.scenarios.values()))
     traces = (process for _, process in processes if isinstance(process, Trace))
     for table in {id(trace.table): trace.table for trace in traces}.values():
         if table.time_ms is None:
             continue
-        # Each group begins at 0: no positive step leads into it.
+        # Each group begins at 0, so steps between groups are not positive.
         steps_ms = np.diff(table.time_ms)
         steps_ms = np.sort(steps_ms[steps_ms > 0])
         usual_ms, longest_ms = steps_ms[[(len(steps_ms) - 1) // 2, -1]] if len(steps_ms) else (0, 0)
@@ -491,7 +491,7 @@ def _odd_traces(problem: Problem) -> Iterator[Fault]:
 
 
 def _short_dwell(problem: Problem) -> Iterator[Fault]:
-    """Yield a dwell that is shorter than the time between two decisions."""
+    """Yield a dwell time shorter than the time between two decisions."""
     cycles, every = problem.controller.min_dwell_cycles, problem.decide_cycles
     if 0 < cycles < every:
         yield Fault(
@@ -502,7 +502,7 @@ def _short_dwell(problem: Problem) -> Iterator[Fault]:
 
 
 def _stale_commands(problem: Problem) -> Iterator[Fault]:
-    """Yield a largest age of commands that is less than the latency of each cycle."""
+    """Yield candidates whose latency always exceeds the largest age of commands."""
     pipeline, age_ms = problem.pipeline, problem.live.max_age_ms
     if age_ms is None:
         return
@@ -525,15 +525,14 @@ def _stale_commands(problem: Problem) -> Iterator[Fault]:
 
 
 def _shortest(process: Process) -> float:
-    """Return the smallest of many values of a process."""
+    """Return the smallest of `DRAWS` samples of a process."""
     return float(process.marginal(np.random.default_rng(1), DRAWS).min())
 
 
 def _unstable_loops(problem: Problem, profile: Profile) -> Iterator[Fault]:
-    """Yield candidates under which the servo loop swings ever farther.
+    """Yield candidates under which the servo loop is unstable.
 
-    The delay of the loop is the mean latency and half a period, for which a command is held in the
-    mean.
+    The delay of the loop is the mean latency plus half a period, the average time since a command.
     """
     if problem.servo is None:
         return
@@ -550,9 +549,10 @@ def _unstable_loops(problem: Problem, profile: Profile) -> Iterator[Fault]:
 
 
 def longest_delay_s(servo: Servo) -> float:
-    """Delay from which on a servo loop is not stable, seconds.
+    """Return the delay above which a servo loop is unstable, seconds.
 
-    The phase margin of K / s, or of (K + B s) / s², over the frequency at which the gain is 1.
+    It is the phase margin of K / s, or of (K + B s) / s², divided by the frequency at which the
+    gain is 1.
     """
     gain, damping = servo.gain, servo.damping
     if servo.plant == "integrator":

@@ -61,5 +61,5 @@ class Corrected(Learning):
 
 
 def _place(part: Part) -> str:
-    """The node or link that a part is on."""
+    """Return the node or link of a part."""
     return part.link if isinstance(part, Message) else part.node

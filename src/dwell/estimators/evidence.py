@@ -7,7 +7,8 @@ same instants.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -26,7 +27,7 @@ UNKNOWN = -1
 class Instants:
     """Instants of the jobs and messages of a window's cycles, nanoseconds; `UNKNOWN` if never.
 
-    An array is None if the engine does not measure it.
+    Arrays that the engine omits are None.
 
     Parameters
     ----------
@@ -69,20 +70,15 @@ class Instants:
         return placement, self.ready_ns, self.end_ns, self.arrived_ns, work_ns, start_ns
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Evidence:
     """Instants of a window, as known at its end; tasks and flows in the pipeline's order.
 
     Parameters
     ----------
     release_ns : int64 array, shape (W,)
-    placement : int array, shape (W,)
-        Index of the candidate that each cycle ran under.
-    shadow_placement : int array, shape (W,)
-        Index of the candidate that a cycle was also sent through; -1 for none.
-    shadows : Instants or None
-        Instants of the jobs and messages that a shadow did not share with the cycle itself. It
-        stops before the sinks: its last messages arrive there and are discarded.
+    rows : WindowRows
+        All instants as one table.
     shadows_share : bool
         Whether shadow jobs share the cores that own jobs leave equally with foreign threads. If
         they have lower priority, their times do not show the number of foreign threads.
@@ -90,38 +86,68 @@ class Evidence:
 
     close_ns: int
     release_ns: Ints
-    placement: NDArray[np.integer]
-    cycles: Instants
-    shadow_placement: NDArray[np.integer]
-    shadows: Instants | None
+    rows: WindowRows
     shadows_share: bool = True
-    _rows: WindowRows | None = field(default=None, init=False, repr=False, compare=False)
 
     @classmethod
-    def of(cls, rows: WindowRows, close_ns: int, release_ns: Ints) -> Evidence:
-        """Make the evidence from a table of instants."""
-        placement, ready, end, arrived, work, start = rows.columns(shadow=False)
-        cycles, shadows = Instants(ready, end, arrived, start, work), None
-        if rows.has_shadows:
-            sent, ready, end, arrived, work, start = rows.columns(shadow=True)
-            shadows = Instants(ready, end, arrived, start, work)
-        else:
-            sent = np.full_like(placement, -1)
-        made = cls(close_ns, release_ns, placement, cycles, sent, shadows)
-        object.__setattr__(made, "_rows", rows)
-        return made
+    def of(
+        cls,
+        close_ns: int,
+        release_ns: Ints,
+        placement: NDArray[np.integer],
+        cycles: Instants,
+        shadow_placement: NDArray[np.integer],
+        shadows: Instants | None,
+        *,
+        shadows_share: bool = True,
+    ) -> Evidence:
+        """Make the evidence from the instants of cycles and of their shadows."""
+        sent = None if shadows is None else shadows.columns(shadow_placement)
+        rows = WindowRows.of(cycles.columns(placement), sent)
+        return cls(close_ns, release_ns, rows, shadows_share)
 
-    @property
-    def rows(self) -> WindowRows:
-        """All instants as one table, cached."""
-        if self._rows is None:
-            sent = None
-            if self.shadows is not None:
-                sent = self.shadows.columns(self.shadow_placement)
-            rows = WindowRows.of(self.cycles.columns(self.placement), sent)
-            object.__setattr__(self, "_rows", rows)
-            return rows
-        return self._rows
+    def with_instants(self, cycles: Instants, shadows: Instants | None) -> Evidence:
+        """Return the evidence with other instants."""
+        return Evidence.of(
+            self.close_ns,
+            self.release_ns,
+            self.placement,
+            cycles,
+            self.shadow_placement,
+            shadows,
+            shadows_share=self.shadows_share,
+        )
+
+    # Most windows need only the table.
+
+    @cached_property
+    def placement(self) -> Ints:
+        """Index of the candidate that each cycle ran under, shape (W,)."""
+        return self.rows.columns(shadow=False)[0]
+
+    @cached_property
+    def cycles(self) -> Instants:
+        """Instants of the jobs and messages of the cycles."""
+        return self._instants(shadow=False)
+
+    @cached_property
+    def shadow_placement(self) -> Ints:
+        """Index of the candidate that a cycle was also sent through; -1 for none."""
+        if self.rows.has_shadows:
+            return self.rows.columns(shadow=True)[0]
+        return np.full_like(self.placement, -1)
+
+    @cached_property
+    def shadows(self) -> Instants | None:
+        """Instants of the jobs and messages that a shadow did not share with the cycle itself.
+
+        It stops before the sinks: its last messages arrive there and are discarded.
+        """
+        return self._instants(shadow=True) if self.rows.has_shadows else None
+
+    def _instants(self, *, shadow: bool) -> Instants:
+        _, ready, end, arrived, work, start = self.rows.columns(shadow=shadow)
+        return Instants(ready, end, arrived, start, work)
 
     def __repr__(self) -> str:
         shadows = int((self.shadow_placement >= 0).sum())

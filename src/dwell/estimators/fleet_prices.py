@@ -1,8 +1,9 @@
-"""Fleet prices: what a whole fleet comes to at given placements, by the kernel.
+"""Prices of a complete fleet at given placements, simulated with the kernel.
 
-All cells are played together, each under its present (see `dwell.estimators.presents`), on draws
-and phases that are the same whatever the placements are: Φ is a function of these alone. A cell
-that has nothing on a shared node meets no other, so that it is played once.
+All cells are simulated together, each under its measured conditions (see
+`dwell.estimators.presents`). Realisations and phases are the same for all placements, so Φ depends
+on the placements alone. A cell without tasks on a shared node does not affect other cells and is
+simulated once per candidate.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from dwell.estimators.presents import Present, realised
 from dwell.estimators.prices import SEED
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, lay_out
-from dwell.kernels.codes import EventKind, cell_of, kind_of
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
@@ -31,68 +31,47 @@ from dwell.model.scenario import Scenario
 #: Candidate of each cell, in their order; None for a cell that is left out.
 Placements: TypeAlias = tuple[str | None, ...]
 
-#: Cycles of all cells together that are played of a fleet, and fewest windows of a cell, the first
-#: of which settles queues: in less than half a minute there are too few bursts of others.
+#: Simulated cycles of all cells together; fewest windows of a cell, including the first, in which
+#: queues settle. Less than half a minute has too few bursts of foreign threads.
 CYCLES, FEWEST = 10_000, 9
 AS_DECLARED = Present()
 
 
 @dataclass(frozen=True, slots=True)
 class PricedCell:
-    """A cell of a fleet, as it is priced.
-
-    Parameters
-    ----------
-    name : str
-    problem : Problem
-        With its phase.
-    streams : str
-        What the names of its random streams begin with.
-    scenario : str
-        What befalls it beside its present.
-    """
+    """A cell of a fleet, with all that its price depends on."""
 
     name: str
+    #: With its phase.
     problem: Problem
+    #: Prefix of the names of its random streams.
     streams: str = ""
+    #: Scenario that is simulated in addition to the measured conditions.
     scenario: str = "baseline"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CellPrice:
-    """What a cell came to among the others, in the mean over windows.
+    """QoS and cost of a cell in a simulated fleet, averaged over windows."""
 
-    Parameters
-    ----------
-    qos : QoS
-        As a controller sees it, without the utilisation of shared nodes.
-    cost : float
-        J without switching, and without the utilisation of shared nodes.
-    windows : float64 array, shape (windows, 2)
-        L95, milliseconds, and V_D of each.
-    """
-
+    #: As a controller measures it, without the utilisation of shared nodes.
     qos: QoS
+    #: J without switching and without the utilisation of shared nodes.
     cost: float
+    #: L95, milliseconds, and V_D of each window, shape (windows, 2).
     windows: Floats
 
 
 @dataclass(frozen=True, slots=True)
 class FleetPrice:
-    """What a fleet came to.
+    """Price of a fleet: its cells and its shared nodes."""
 
-    Parameters
-    ----------
-    cells : tuple of CellPrice
-        By cell; None for one that was left out.
-    shared : float
-        What the utilisation of shared nodes costs: α·U/U* of each, the mean over cells.
-    used : mapping of str to float
-        Utilisation of the shared nodes' resources by all, as the first cell sees it that is there.
-    """
-
+    #: Price of each cell; None for a cell that is left out.
     cells: tuple[CellPrice | None, ...]
+    #: Cost of the utilisation of shared nodes: α·U/U* of each, averaged over cells.
     shared: float
+    #: Utilisation of the shared nodes' resources by all cells, in the windows of the first cell
+    #: that uses a shared node.
     used: Mapping[str, float]
 
     def __repr__(self) -> str:
@@ -105,16 +84,16 @@ class FleetPrice:
 
     @property
     def parts(self) -> list[float]:
-        """J of every cell; then, the cost of shared nodes."""
+        """J of every cell, then the cost of shared nodes."""
         return [*self.costs, self.shared]
 
     @property
     def phi(self) -> float:
-        """Φ."""
+        """Φ, the sum of `parts`."""
         return sum(self.parts)
 
     def qos(self, index: int) -> QoS | None:
-        """What a cell came to, with the utilisation of shared nodes."""
+        """Return the QoS of a cell, with the utilisation of shared nodes."""
         cell = self.cells[index]
         if cell is None:
             return None
@@ -122,17 +101,10 @@ class FleetPrice:
 
 
 class FleetPrices:
-    """Plays a fleet at one placements after another.
+    """Simulated prices of a fleet by its placements.
 
-    Parameters
-    ----------
-    cells : sequence of PricedCell
-    shared : sequence of str
-        Nodes that are one computer for all cells.
-    cycles : int
-        Cycles of all cells together.
-    disturbances : sequence of Disturbance
-        What happens to shared nodes.
+    Each node in `shared` is one computer for all cells. `cycles` is the number of simulated cycles
+    of all cells together; `disturbances` are the disturbances of shared nodes.
     """
 
     def __init__(
@@ -175,23 +147,21 @@ class FleetPrices:
         return f"<FleetPrices: {len(self.cells)} cells, shared: {', '.join(self.shared)}>"
 
     def meets(self, placement: Placement) -> bool:
-        """Whether a placement has anything on a shared node."""
+        """Whether a placement uses a shared node."""
         return not set(self.shared).isdisjoint(placement.values())
 
     def begin(self, presents: Sequence[Present], absent: Collection[int] = ()) -> None:
-        """Begin with other presents, one a cell; of a shared node the middle of them holds.
+        """Begin with other measured conditions, one per cell.
 
-        Parameters
-        ----------
-        absent : collection of int
-            Cells whose presents do not count on shared nodes.
+        A shared node has the median of its foreign threads over cells, and is down if it is down in
+        any cell. Cells in `absent` do not count for shared nodes.
         """
         given = zip(presents, self._presents, strict=True)
         changed = [i for i, (present, before) in enumerate(given) if present is not before]
         if not changed and self._absent == frozenset(absent):
             return
         self._presents, self._absent = list(presents), frozenset(absent)
-        # What befalls shared nodes is played with the first cell.
+        # The first cell's realisation includes the conditions of shared nodes.
         for i in dict.fromkeys((0, *changed)):
             cell, declared = self.cells[i], self._declared[i]
             self._real[i] = realised(cell.problem, declared, self._of(i))
@@ -200,7 +170,7 @@ class FleetPrices:
         self._first = None
 
     def _of(self, index: int) -> Present:
-        """Present of a cell; of shared nodes that of the first one speaks, for all."""
+        """Return a cell's measured conditions; the first cell's also describe shared nodes."""
         present = self._presents[index]
         threads, down = dict(present.threads), set(present.down)
         for name in self.shared:
@@ -216,11 +186,11 @@ class FleetPrices:
         return replace(present, threads=FrozenDict(threads), down=frozenset(down))
 
     def knows(self, placements: Placements) -> bool:
-        """Whether the fleet was played at some placements under these presents."""
+        """Whether the price at some placements is known under these measured conditions."""
         return placements in self._known
 
     def price(self, placements: Placements) -> FleetPrice:
-        """Play the fleet at some placements; what was played under these presents is known."""
+        """Return the price at some placements; simulate it once per measured conditions."""
         known = self._known.get(placements)
         if known is None:
             known = self._known[placements] = self._price(placements)
@@ -230,7 +200,7 @@ class FleetPrices:
         placed = {i: name for i, name in enumerate(placements) if name is not None}
         there = [i for i, name in placed.items() if self._meets[i][name]]
         new = [i for i, name in placed.items() if name not in self._alone[i]]
-        # The first that is on a shared node sees it; where nobody is, somebody looks.
+        # The first cell on a shared node measures its utilisation; else, the first cell.
         watcher = min(there or placed)
         plays = {watcher, *there, *new}
         arrays = self._played(placements, plays)
@@ -259,16 +229,7 @@ class FleetPrices:
             if name is not None:
                 stamps[i] = self._index[i][name]
         arrays.replace(stamps=stamps)
-        # A cell that does not play is never released.
-        tables = arrays.tables
-        clock = tables.clock[0]
-        events = tables.events[: clock["n_events"]]
-        kept = [
-            kind_of(key) != EventKind.RELEASE or cell_of(key) in plays
-            for key in events["key"].tolist()
-        ]
-        clock["n_events"] = sum(kept)
-        tables.events[: clock["n_events"]] = events[kept]
+        arrays.leave_out(set(range(len(self.cells))).difference(plays))
         play(arrays)
         return arrays
 
@@ -284,21 +245,16 @@ class FleetPrices:
         return CellPrice(qos, terms.cost(qos), windows)
 
     def _used(self, arrays: Arrays, i: int) -> dict[str, float]:
-        """Utilisation of every resource, by all, in the mean over a cell's windows."""
+        """Return the utilisation of each resource by all cells, averaged over a cell's windows."""
         resources = self._terms[i].resources
         shares = arrays.tables.shares[i, 1 : self._windows[i], 0, : len(resources)].mean(axis=0)
         return dict(zip(resources, shares.tolist(), strict=True))
 
 
 class CellTerms:
-    """Terms of a cell's J: those of its own, and those of shared nodes.
+    """Terms of a cell's J: its own terms, and the terms of shared nodes.
 
-    Attributes
-    ----------
-    resources : tuple of str
-        All of the cell's.
-    of_shared : set of str
-        Those of shared nodes.
+    `resources` are all resources of the cell, `of_shared` the resources of shared nodes.
     """
 
     def __init__(self, problem: Problem, shared: Sequence[str]) -> None:
@@ -315,7 +271,7 @@ class CellTerms:
         self._own, self._shared = [], []
         for factor, names in zip(factors, tier_nodes(objective), strict=True):
             self._own.append([name for name in names if name not in self.of_shared])
-            # Of a shared node, its accelerators with it, the fullest counts.
+            # The fullest resource of a shared node counts, accelerators included.
             for node in shared:
                 here = [name for name in names if node_of[name] == node]
                 if here:
@@ -328,23 +284,23 @@ class CellTerms:
         return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective))
 
     def of_one(self) -> dict[str, float]:
-        """What one busy core, or place, of each shared resource would cost the cell."""
+        """Return the cost to the cell of one busy core, or place, of each shared resource."""
         return {
             name: factor / self._capacity[name] for factor, names in self._shared for name in names
         }
 
     def shared_cost(self, used: Mapping[str, float]) -> float:
-        """What the utilisation of shared nodes would cost the cell."""
+        """Return the cost to the cell of the utilisation of shared nodes."""
         return sum(factor * _most(names, used) for factor, names in self._shared)
 
 
 def _most(names: Sequence[str], used: Mapping[str, float]) -> float:
-    """Utilisation of the fullest of some resources that are known."""
+    """Return the utilisation of the fullest resource; unknown resources count as 0."""
     return max((used.get(name, 0.0) for name in names), default=0.0)
 
 
 def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> int:
-    """Windows that are played of a cell: all cells for about as long."""
+    """Return the number of simulated windows of a cell, for about the same time in all cells."""
     periods_ms = [cell.problem.pipeline.period_ms for cell in cells]
     span_ms = cycles / sum(1 / period_ms for period_ms in periods_ms)
     window_ms = problem.window_ms

@@ -1,7 +1,7 @@
-"""Foreign threads of a node: how many there are beyond those that the cell declares.
+"""Number of foreign threads of a node in addition to the declared threads.
 
-Where others leave something of a node, its load says how many there are. A full node hides it;
-there the cell's own jobs tell, by how much longer they took than the core time that they received.
+The load of a node shows their number unless the node is full. On a full node the cell's own jobs
+show it: they take longer than the core time that they receive.
 """
 
 from __future__ import annotations
@@ -12,45 +12,33 @@ from typing import NamedTuple
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import cores_of, cores_on
-from dwell.kernels.jobs import NodeJobs, level
+from dwell.kernels.jobs import NodeJobs, SlowedJobs
 from dwell.model.fabric import Node
 from dwell.model.pipeline import Execution
 from dwell.model.problem import Problem
 
-#: Foreign load is other than declared where it is so many deviations of a window off, and a share
-#: of the cores beyond that.
+#: Foreign load has changed if it differs from the declared load by more than this many standard
+#: deviations of a window plus this share of the cores.
 DEVIATIONS, LEAST_SHARE = 4.0, 0.05
 #: Windows over which a level is averaged.
 WINDOWS = 3
 
 
 class Level(NamedTuple):
-    """Foreign threads beside which jobs ran beyond those of bursts, with the standard error.
+    """Estimate of a node's foreign threads from its jobs."""
 
-    Parameters
-    ----------
-    is_slowed : bool
-        Whether they took something of what most jobs wanted; if not, there may be fewer.
-    """
-
+    #: Number in addition to bursts.
     threads: float
+    #: Standard error of `threads`.
     error: float
+    #: Whether they slowed most jobs down; if not, there may be fewer threads.
     is_slowed: bool
 
 
 class ForeignThreads:
-    """Foreign threads of one node beyond those that are declared.
+    """Foreign threads of one node; `decisions` is the number of decisions per window.
 
-    Parameters
-    ----------
-    node : Node
-    decisions : float
-        Decisions per window.
-
-    Attributes
-    ----------
-    beyond : float
-        How many more there are; negative where there are fewer.
+    `beyond` is the number in addition to the declared threads, negative for fewer.
     """
 
     def __init__(self, node: Node, decisions: float = 1.0) -> None:
@@ -64,7 +52,7 @@ class ForeignThreads:
 
     @property
     def threads(self) -> float:
-        """Average number, declared ones included."""
+        """Mean number, including declared threads."""
         return max(self._burst_threads + self.beyond, 0.0)
 
     def see(
@@ -76,18 +64,12 @@ class ForeignThreads:
         *,
         is_full: bool,
     ) -> bool:
-        """Take in what a window showed; returns whether that is a change.
+        """Add the measurement of a window; return whether `beyond` has changed.
 
-        Parameters
-        ----------
-        share : float
-            Of the node, that others took.
-        usual, deviation : float
-            Mean and standard deviation of a window's share as declared.
-        level : callable
-            Says what the cell's jobs tell, if anything; asked where the share does not tell all.
-        is_full : bool
-            Whether nothing of the node was left, so that there may be more than the share says.
+        `share` is the share of the node that others used; `usual` and `deviation` are its mean and
+        standard deviation as declared. If `is_full`, there may be more threads than `share` shows.
+        `level` estimates the threads from the cell's jobs; it is called only if `share` has changed
+        or the node is full.
         """
         capacity = self._capacity
         noise = DEVIATIONS * deviation + LEAST_SHARE
@@ -102,15 +84,15 @@ class ForeignThreads:
             return self._see(beyond, noise * capacity)
         least = share * capacity
         if self.threads + LEAST_SHARE * capacity >= least and self.beyond > 0.0:
-            return False  # what was known before says more
-        # A thread for each core is the fewest that fill it.
+            return False  # the earlier number is at least as large
+        # At least one thread per core fills the node.
         return self._see(max(capacity - self._burst_threads, 0.0), least)
 
     def _see(self, seen: float, noise: float) -> bool:
         is_jump = abs(seen - self._mean) > noise or (seen == 0.0) != (self._mean == 0.0)
         self._windows = 1 if is_jump else min(self._windows + 1, self._most)
         self._mean += (seen - self._mean) / self._windows
-        # What drifts is taken over in steps.
+        # A drift changes `beyond` in steps.
         step = LEAST_SHARE / 2 * (self._capacity + abs(self._mean))
         if not is_jump and abs(self._mean - self.beyond) <= step:
             return False
@@ -119,28 +101,23 @@ class ForeignThreads:
 
 
 class Stretches:
-    """Tells from a window's jobs next to how many foreign threads they ran.
+    """Estimates of foreign threads from the jobs of a window.
 
-    Some jobs leave others room, and take no longer for it: they show only how many threads there
-    are at most. The jobs of each task since its last change are compared with their times alone;
-    tasks of which most jobs are slowed count, if there are any.
-
-    Parameters
-    ----------
-    shared : collection of str
-        Nodes on which jobs run next to those of other cells. They speak only where all share the
-        cores evenly, and the evidence says next to how many threads each job ran.
+    The jobs of each task since its last change are compared with their times alone on the node. If
+    most jobs of some tasks are slowed, only these tasks count; jobs that are not slowed show only
+    an upper bound. Jobs of other cells run on the nodes in `shared`. There, jobs count only if all
+    share the cores evenly and the evidence has the number of threads that ran with each job.
     """
 
     def __init__(self, problem: Problem, shared: Collection[str] = ()) -> None:
         self._problem, self._shared = problem, shared
-        self._on: dict[str, NodeJobs] = {}
+        self._on: dict[str, SlowedJobs] = {}
 
     def level(self, evidence: Evidence, name: str) -> Level | None:
-        """What the jobs on a node say; None where they say nothing.
+        """Return the estimate from the jobs on a node; None if they allow no estimate.
 
-        Own jobs count if there are enough, else shadow jobs, where these share what own jobs leave
-        with foreign threads as equals.
+        Own jobs count if there are enough; if not, shadow jobs do, provided that they share the
+        remaining cores evenly with foreign threads.
         """
         rows, is_shared = evidence.rows, name in self._shared
         node = self._problem.fabric.nodes[name]
@@ -149,24 +126,25 @@ class Stretches:
         ):
             return None
         shadows = evidence.shadows_share
-        told = level(self._jobs_on(name), rows, shadows=shadows, is_shared=is_shared)
+        told = self._jobs_on(name).level(rows, shadows=shadows, is_shared=is_shared)
         if told is None:
             return None
         threads, error, is_slowed = told
-        # Nanoseconds of an instant are none.
+        # Instants are rounded to nanoseconds: a tiny number is 0.
         return Level(max(round(threads, 3), 0.0), error, is_slowed)
 
-    def _jobs_on(self, name: str) -> NodeJobs:
+    def _jobs_on(self, name: str) -> SlowedJobs:
         if name not in self._on:
             node = self._problem.fabric.nodes[name]
             spare = node.spare if node.quota is None else node.capacity
             bursts = 0.0 if node.bursts is None else node.bursts.share
             cores = cores_on(self._problem, node, partial(_turns, node))
             is_fair = node.scheduler == "fair"
-            self._on[name] = NodeJobs(cores, is_fair, node.cores, spare, bursts)
+            jobs = NodeJobs(cores, is_fair, node.cores, spare, bursts)
+            self._on[name] = SlowedJobs(jobs, len(self._problem.pipeline.flows))
         return self._on[name]
 
 
 def _turns(node: Node, execution: Execution) -> float:
-    """Cores that a job asks for; of a fair node all its threads take turns with others."""
+    """Return the cores of a job; on a fair node, the number of its threads."""
     return execution.threads if node.scheduler == "fair" else cores_of(node, execution)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import ClassVar, Self
 
 import numpy as np
@@ -31,20 +31,10 @@ EARLY = 0.9
 class Learning(Online):
     """Base of the estimators that keep a pool of values per part.
 
-    Parameters
-    ----------
-    shadow_fraction : float, optional
-        Share of cycles sent through each alternative [default: the cell file's]. If the file sets
-        `auto`, the share depends on the active candidate (`dwell.estimators.shadow_price`).
-    half_life_windows : float, optional
-        Unit of `MEMORY` and `UNSEEN` [default: the cell file's].
-    seed : int
-        Seed of the simulations.
-
-    Raises
-    ------
-    ProblemError
-        If `half_life_windows` is out of its range.
+    `shadow_fraction` is the share of cycles sent through each alternative [default: the cell
+    file's]. If the file sets `auto`, the share depends on the active candidate
+    (`dwell.estimators.shadow_price`). `half_life_windows` is the unit of `MEMORY` and `UNSEEN`
+    [default: the cell file's]; a value outside its range raises `ProblemError`.
     """
 
     #: Half-lives until newer values replace a measured value, and until a part without new
@@ -98,56 +88,57 @@ class Learning(Online):
             row[: len(numbers)] = numbers
         self._rows = PoolRows([self._pools[part].rows for part in self._meter.parts], padded)
 
-    def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
+    def _take_in(self, evidence: Evidence) -> None:
         self._window += 1
         cycles = len(evidence.release_ns)
-        changed = self._learn(demands, cycles)
+        changed = self._learn(cycles)
+        # Without a change the names of the measured parts are unnecessary.
+        measured = self._meter.found_parts if changed or self._doubts else []
         for pool in map(self._pools.__getitem__, self._otherwise_parts()):
             if pool.touched and self._window - pool.touched >= max(self.unseen, 1.0):
                 pool.reset()
                 self._has_changed = True
-        links = self._links_of_other_rates(demands, changed, evidence)
+        links = self._links_of_other_rates(measured, changed, evidence)
         if links:
             of = [part for part in self._pools if isinstance(part, Message) and part.link in links]
             for part in of:
                 self._pools[part].reset()
-            demands = self._meter.demands(evidence, self._threads)
+            self._meter.measure(evidence, self._threads)
+            measured = self._meter.found_parts
             changed = [part for part in changed if part not in of]
-            changed += self._learn({part: demands[part] for part in of if part in demands}, cycles)
+            changed += self._learn(cycles, [part for part in of if part in measured])
             self._has_changed = True
         self._regimes += len(changed) + len(links)
         if changed:
             self._has_changed = True
-            self._correct(changed, frozenset(demands))
+            self._correct(changed, frozenset(measured))
 
-    def _learn(self, demands: Mapping[Part, Floats], cycles: int) -> list[Part]:
-        """Add values to the pools of their parts; return the parts that have changed."""
+    def _learn(self, cycles: int, only: Sequence[Part] | None = None) -> list[Part]:
+        """Add values to the pools of their parts, or of some; return the changed parts."""
         changed = []
         # Number of comparisons of a part with its reference in one window of the cell.
         tests = len(self._pools) * max(self.problem.window_cycles / cycles, 1.0)
         least = least_deviations(tests)
         # Most pools have their declared values and need no decision.
         when = self._window, self.memory, cycles
-        parts = self._meter.numbers(demands)
-        looks = self._rows.learn(self._meter.found, parts, *when, least)
-        for (part, values), why in zip(demands.items(), looks, strict=False):
-            if not why:
-                continue
+        found, parts = self._meter.found, None if only is None else self._meter.numbers(only)
+        for number, why in self._rows.learn(found, *when, least, parts):
             if why == GROWN:
                 self._has_grown = True
                 continue
+            part = self._meter.parts[number]
             pool = self._pools[part]
             if why == ADDED:
                 has_changed = pool.has_left(self._window, cycles, least)
             else:
-                has_changed = pool.learn(values, *when, tests)
+                has_changed = pool.learn(found.values(number), *when, tests)
             if has_changed:
                 changed.append(part)
             self._has_grown |= not pool.is_declared
         return changed
 
     def _links_of_other_rates(
-        self, demands: Mapping[Part, Floats], changed: Sequence[Part], evidence: Evidence
+        self, measured: Sequence[Part], changed: Sequence[Part], evidence: Evidence
     ) -> set[str]:
         """Set the rates of links whose messages show a new rate, and return the links."""
         links = set()
@@ -156,12 +147,12 @@ class Learning(Online):
                 self._doubts[part.link] = self._window
         for link, since in self._doubts.items():
             after = self._window - since
-            parts = [p for p in demands if isinstance(p, Message) and p.link == link]
+            parts = [p for p in measured if isinstance(p, Message) and p.link == link]
             declared, now = self.problem.fabric.links[link].rate_mbps, self._rates.get(link)
             found = None
             if now is not None and self._is_faster(evidence, parts, now.mbps):
                 found = Rate(declared)
-            # After 0, 1, 2, 4, ... decisions.
+            # Try after 0, 1, 2, 4, ... decisions.
             elif not after & (after - 1) and not all(self._pools[p].is_declared for p in parts):
                 found = self._better_rate(link, parts, evidence)
             if found is not None:
@@ -213,8 +204,9 @@ class Learning(Online):
     def support(self) -> dict[str, Support]:
         """Return the support of each candidate's estimate: the support of its weakest part."""
         self._take_in_pending()
+        now, every = self._window, self.problem.decisions_per_window
         return {
-            name: Support(samples, self._windows_since(last))
+            name: Support(samples, (now - last) / every)
             for name, (samples, last) in zip(self._parts, self._rows.weakest(), strict=True)
         }
 

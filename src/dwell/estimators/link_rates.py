@@ -16,7 +16,7 @@ import numpy as np
 from dwell.kernels.elementary import logarithms
 from dwell.model.number_arrays import Floats
 
-#: First rates to try: the largest, ratio of each to the one before, and number of rates.
+#: First rates to try: the largest, the ratio of successive rates, and their number.
 FASTEST_MBPS, SHARE, TRIED = 1000.0, 0.6, 18
 #: Then relative distances around the best rate, and steps in each direction.
 NEARER, STEPS = (0.4, 0.05, 0.006), 8
@@ -38,14 +38,10 @@ class Rate(NamedTuple):
 def better_rate(
     extra_ms: Callable[[float], Floats], now_mbps: float, declared_mbps: float, deviation_ms: float
 ) -> Rate | None:
-    """Return the rate that explains messages better than a rate with a delay; None if none does.
+    """Return the rate, if any, that explains messages better than the current rate with a delay.
 
-    Parameters
-    ----------
-    extra_ms : callable
-        Extra delay of every message at a rate; NaN where it arrived too early for that rate.
-    deviation_ms : float
-        Mean absolute deviation of the delay as declared.
+    `extra_ms` returns the extra delay of every message at a rate; NaN if the message arrived too
+    early for the rate. `deviation_ms` is the mean absolute deviation of the declared delay.
     """
 
     def spread_ms(mbps: float) -> float:
@@ -63,12 +59,12 @@ def better_rate(
     if count * _log(before_ms, max(spread_ms(best), least_ms)) < GAIN / 2:
         return None
     for width in NEARER:
-        # From the fastest, which is the first of equal ones.
+        # The fastest rate is first: `min` returns the first of equal rates.
         best = min(
             (best * (1 + width * k / STEPS) for k in range(STEPS, -STEPS, -1)), key=spread_ms
         )
-    # Each of both has a location and a scale of exponential deviations (Laplace), which is not
-    # smaller than the declared one.
+    # Both explanations have a location and exponential deviations (Laplace), with a scale of at
+    # least the declared scale.
     after_ms = max(spread_ms(best), least_ms)
     if count * _log(before_ms, after_ms) < GAIN:
         return None

@@ -1,10 +1,10 @@
-"""Load table: what candidates of a fleet's cells come to by how loaded a shared node is.
+"""Table of L95 and V_D of a fleet's candidates by the load of a shared node.
 
-For every kind of cell and every candidate that uses a shared node, more and more cells are played
-on it together, from one up to all cells of the fleet: those of the kind first, then the others on
-the candidate with which they have most work. All levels are played on the same draws, and the price
-of a cell alone is known well, so that it serves as a control variate (DOI 10.1287/opre.30.5.961).
-The table proposes moves; Φ itself is played (see `dwell.estimators.fleet_prices`).
+For every kind of cell and every candidate that uses a shared node, the load grows from one cell to
+all cells of the fleet: first the cells of the kind, then the others, each on its candidate with the
+most work. All levels are simulated with the same realisations. The cell alone serves as a control
+variate (DOI 10.1287/opre.30.5.961), because its price is known precisely. The table only proposes
+moves; Φ is simulated (see `dwell.estimators.fleet_prices`).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.progress import Progress
 
-#: Cycles of all levels of a candidate together; fewest and most of a cell at each level.
+#: Simulated cycles of a candidate, all levels together; fewest and most per cell and level.
 CYCLES, FEWEST, MOST = 1_000_000, 3_000, 15_000
-#: Most levels of a candidate; between them the table is interpolated.
+#: Most levels of a candidate; readers interpolate between levels.
 LEVELS = 14
-#: How many fleets are remembered.
+#: Number of fleets whose tables are kept.
 KEPT = 8
 
 
@@ -33,16 +33,11 @@ KEPT = 8
 class LoadColumn:
     """A candidate of a kind of cell, by the load of the shared resource that it fills most.
 
-    Parameters
-    ----------
-    level : float64 array, shape (levels,)
-        Cores, or places, that all cells keep busy there, ascending; the first is that of one cell.
-    l95_ms, violation_rate : float64 array, shape (levels,)
-        Mean over the cells of the kind.
-    l95_error_ms, violation_error : float64 array, shape (levels,)
-        Their standard errors, by how windows differ.
+    All arrays have shape (levels,). L95 and V_D are means over the cells of the kind; their
+    standard errors come from the differences between windows.
     """
 
+    #: Cores, or places, that all cells keep busy, ascending; the first level has one cell.
     level: Floats
     l95_ms: Floats
     violation_rate: Floats
@@ -54,23 +49,16 @@ class LoadColumn:
 
 
 class LoadTable:
-    """What candidates come to by load.
+    """L95 and V_D of the candidates of a fleet by load.
 
-    Parameters
-    ----------
-    cells : sequence of PricedCell
-    shared : sequence of str
-    progress : callable, optional
-        Told how many of how many levels have been played.
+    `cycles` is the number of simulated cycles per cell and level. `progress` is called with the
+    number of simulated levels and the number of all levels. Without `with_columns`, nothing is
+    simulated.
 
-    Attributes
-    ----------
-    kinds : tuple of int
-        Kind of each cell: the first one that is as it is, but for its phase.
-    work : tuple of mapping of str to (resource, work)
-        By cell and candidate, the resource of a shared node that it fills most: the CPU, or a kind
-        of accelerators; and how many cores, or places, it keeps busy.
-    columns : mapping of (kind, candidate) to LoadColumn
+    `kinds` has the kind of each cell, the index of the first cell that differs only in its phase.
+    `work` has, by cell and candidate, the resource of a shared node that it fills most (the CPU or
+    a kind of accelerator) and the number of cores, or places, that it keeps busy. `columns` has the
+    `LoadColumn` of each kind and candidate.
     """
 
     def __init__(
@@ -79,11 +67,15 @@ class LoadTable:
         shared: Sequence[str],
         *,
         cycles: int | None = None,
+        with_columns: bool = True,
         progress: Progress | None = None,
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self.kinds = kinds_of(cells)
         self.work = tuple(_work(cell.problem, shared) for cell in cells)
+        self.columns: dict[tuple[int, str], LoadColumn] = {}
+        if not with_columns:
+            return
         count = sum(map(bool, self.work))
         self._counts = {1 + (count - 1) * i // (LEVELS - 1) for i in range(LEVELS)}
         if cycles is None:
@@ -91,7 +83,6 @@ class LoadTable:
             cycles = min(max(cycles, FEWEST), MOST)
         plays = FleetPrices(cells, shared, cycles * len(cells))
         asked = [(kind, name) for kind in dict.fromkeys(self.kinds) for name in self.work[kind]]
-        self.columns: dict[tuple[int, str], LoadColumn] = {}
         done, levels = 0, len(asked) * len(self._counts)
         for group in asked:
             rows = []
@@ -110,7 +101,7 @@ class LoadTable:
         return self.work[index][name][1]
 
     def _levels(self, plays: FleetPrices, kind: int, name: str) -> Iterator[tuple[float, ...]]:
-        """Yield rows of a column, with more cells at each."""
+        """Yield the rows of a column; the number of cells increases."""
         mine = [i for i, of in enumerate(self.kinds) if of == kind]
         others = [i for i, of in enumerate(self.kinds) if of != kind and self.work[i]]
         placements: list[str | None] = [None] * len(self.cells)
@@ -119,7 +110,7 @@ class LoadTable:
         known = np.array([price.l95_ms, price.violation_rate])
         known_error = np.array([price.l95_error_ms, price.violation_error])
         for count, i in enumerate(mine + others, 1):
-            # The others ask for as much as they may.
+            # Cells of other kinds use their candidate with the most work.
             placed = name if i in mine else max(self.work[i], key=partial(self._asked, i))
             placements[i], (resource, work) = placed, self.work[i][placed]
             level += work if resource == asked else 0.0
@@ -135,7 +126,7 @@ class LoadTable:
 def _controlled(
     windows: Floats, alone: Floats, known: Floats, known_error: Floats
 ) -> tuple[Floats, Floats]:
-    """Means over windows with their standard errors; those of the cell alone are known."""
+    """Return means over windows with standard errors; the cell alone is the control variate."""
     count = len(windows)
     if count < 3:
         return windows.mean(axis=0), np.full(2, np.inf)
@@ -155,7 +146,7 @@ def load_table(
     shared: Sequence[str],
     progress: Progress | None = None,
 ) -> LoadTable:
-    """Return the table of a fleet; what was asked before is not played again."""
+    """Return the table of a fleet; known tables are not simulated again."""
     asked = tuple(cells), tuple(shared)
     if asked not in _known:
         _known[asked] = LoadTable(*asked, progress=progress)
@@ -165,14 +156,14 @@ def load_table(
 
 
 def kinds_of(cells: Sequence[PricedCell]) -> tuple[int, ...]:
-    """Return of every cell the first one of its kind: equal but for phase and name."""
+    """Return for every cell the first cell of its kind: equal except for phase and name."""
     firsts: dict[Problem, int] = {}
     kinds = [cell.problem.at_phase(0.0) for cell in cells]
     return tuple(firsts.setdefault(kind, i) for i, kind in enumerate(kinds))
 
 
 def _work(problem: Problem, shared: Sequence[str]) -> Mapping[str, tuple[str, float]]:
-    """Of every candidate that has work on shared nodes, the resource that it fills most."""
+    """Return the resource that each candidate with work on shared nodes fills most."""
     prices, resources = prices_of(problem), problem.fabric.resources
     found = {}
     for name in problem.candidates:

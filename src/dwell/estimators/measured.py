@@ -1,4 +1,4 @@
-"""What a window showed of each part: a task on a node, or a flow on a link."""
+"""Times and demands of each part in a window: a task on a node, or a flow on a link."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from dwell.model.problem import Problem
 Rows: TypeAlias = slice | Ints
 
 EVERY = slice(None)
-#: So many foreign threads are some.
+#: Fewest foreign threads, in addition to bursts, that slow jobs down by interference.
 BESIDE = 0.5
 
 
@@ -47,13 +47,13 @@ Part: TypeAlias = Site | Message
 
 
 def message_of(source: str, target: str, placement: Placement) -> Message | None:
-    """Return the message of a flow under a placement; None on one node."""
+    """Return the message of a flow under a placement; None if both tasks are on one node."""
     here, there = placement[source], placement[target]
     return Message(source, target, f"{here}->{there}") if here != there else None
 
 
 def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
-    """Every part that a cycle goes through under a placement."""
+    """Yield the parts of a cycle under a placement."""
     for name in pipeline.tasks:
         yield Site(name, placement[name])
     for flow in pipeline.flows:
@@ -63,12 +63,9 @@ def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
 
 
 class Meter:
-    """Takes windows apart into what they show of the parts that jobs and messages went through.
+    """Times and demands of parts, from the jobs and messages of a window.
 
-    Parameters
-    ----------
-    shared : collection of str
-        Nodes on which jobs run beside others that are not in the evidence, and wait for them.
+    On the nodes in `shared`, jobs also wait for jobs of other cells, which the evidence lacks.
     """
 
     def __init__(self, problem: Problem, shared: Collection[str] = ()) -> None:
@@ -87,7 +84,7 @@ class Meter:
         self._link, repeats = self._links()
         self._demands = PartTimes(len(self.parts), self._cost, self._link, repeats)
         nodes = problem.fabric.nodes
-        #: Parts whose jobs need more of the core beside foreign threads, with their nodes.
+        #: Parts whose jobs need more core time next to foreign threads, with their nodes.
         self._interfered = [
             (number, nodes[part.node])
             for number, part in enumerate(self.parts)
@@ -106,79 +103,84 @@ class Meter:
         )
 
     def times(self, evidence: Evidence) -> dict[Part, Floats]:
-        """Times of every part that the window has any of, milliseconds, infinite where lost.
+        """Return the times of each part in the window, milliseconds, infinite if lost.
 
-        They are overwritten by those of the next window.
+        The next window overwrites the values.
         """
-        return self._take_apart(self._times, evidence, evidence.rows)
+        self._take_apart(self._times, evidence, evidence.rows)
+        return self._by_part(self._times)
 
     def demands(
         self, evidence: Evidence, foreign: Mapping[str, float] | None = None
     ) -> dict[Part, Floats]:
-        """Demands of every part that the window has any of, milliseconds, infinite where lost.
+        """Return the demands of each part in the window, milliseconds, infinite if lost.
 
-        The demand of a job is its work: how long it takes alone on its node, with the waits that no
-        job there causes. The demand of a message is its delay: the time on the way less the wait
-        behind other messages of the cell, and less its transmission at the rate of the link. A
-        message that waited for a repeated message counts with the last delay of its link that is
-        not longer than its time on the way. The next window overwrites the values.
+        The demand of a job is its work: its time alone on its node, including waits that no job
+        there causes. The demand of a message is its delay: its time on the way less the wait behind
+        other messages of the cell and less its transmission at the rate of the link. A message that
+        waited for a repeated message has the last delay of its link that is not longer than its
+        time on the way. The next window overwrites the values.
 
-        Parameters
-        ----------
-        foreign : mapping of str to float, optional
-            Foreign threads beside which jobs ran, by node; 0 for what is not in it. What core time
-            a job received is divided by the node's `interference` where there are some beyond
-            those of bursts. Where it is not known, it is told from how long the job took.
+        `foreign` is the number of foreign threads by node [default: 0]. If there are more than
+        the bursts have, the core time of a job is divided by the node's `interference`. If the core
+        time is unknown, it is estimated from the duration of the job.
         """
-        foreign = foreign or {}
+        self.measure(evidence, foreign or {})
+        return self._by_part(self._demands)
+
+    def measure(self, evidence: Evidence, foreign: Mapping[str, float]) -> None:
+        """Compute the demands of a window in `found`, without the mapping of `demands`."""
         self._cost[:] = self._usual_cost
         for number, node in self._interfered:
-            # What bursts cost is in the declared demands, too.
+            # The declared demands include the interference of bursts.
             if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
                 self._cost[number] /= node.interference
         rows = evidence.rows
-        if any(rows.unknown(0)[1:]):
+        if any(rows.unknown(evidence.close_ns - self._patience_ns)[1:]):
             rows = self._with_work(evidence, foreign).rows
-        return self._take_apart(self._demands, evidence, self._with_waits(rows, foreign))
+        self._take_apart(self._demands, evidence, self._with_waits(rows, foreign))
 
     def _with_waits(self, rows: WindowRows, foreign: Mapping[str, float]) -> WindowRows:
-        """Add what most jobs of a task waited for to their work.
+        """Add to the work of jobs the waits that most jobs of their task have in common.
 
         A job of a real system may wait for something that no cell declares: a device, the network,
-        a lock. That wait is a part of its demand, wherever it runs. It shows if jobs took longer
-        than their core time would have, stretched by what the cell's own jobs and foreign threads
-        took meanwhile.
+        a lock. This wait is part of its demand on every node. Jobs have waited if they took longer
+        than their core time explains, with the slowdown by own jobs and foreign threads.
         """
-        rows = rows.copy()
-        # Bursts may be on all the while that a job runs.
-        self._waiting.add(rows, [foreign.get(name, 0.0) + most for name, most in self._sharing])
-        return rows
+        # A burst may last as long as the job.
+        threads = [foreign.get(name, 0.0) + most for name, most in self._sharing]
+        return self._waiting.added(rows, threads)
 
     def waited_ns(self, evidence: Evidence, foreign: Mapping[str, float]) -> Ints:
-        """Core time of own jobs with their waits, shape (n, tasks); see `demands`."""
-        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4]
+        """Return the core time of own jobs with their waits, nanoseconds, shape (n, tasks)."""
+        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4].copy()
 
     def _with_work(self, evidence: Evidence, foreign: Mapping[str, float]) -> Evidence:
-        """Add the core time of jobs where it is not known."""
+        """Add estimates of unknown core times."""
         cycles, shadows = evidence.cycles, evidence.shadows
         work_ns = self.work_ns(cycles, evidence.placement, foreign)
-        told = replace(evidence, cycles=replace(cycles, work_ns=work_ns))
-        if shadows is None:
-            return told
-        work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
-        return replace(told, shadows=replace(shadows, work_ns=work_ns))
+        cycles = replace(cycles, work_ns=work_ns)
+        if shadows is not None:
+            work_ns = self.work_ns(shadows, evidence.shadow_placement, foreign)
+            shadows = replace(shadows, work_ns=work_ns)
+        return evidence.with_instants(cycles, shadows)
 
     @property
     def found(self) -> PartTimes:
-        """What `demands` has found in the last window."""
+        """Demands of the last window (see `measure`)."""
         return self._demands
 
+    @property
+    def found_parts(self) -> list[Part]:
+        """The parts in `found`."""
+        return [self.parts[number] for number in self._demands.numbers]
+
     def numbers(self, parts: Iterable[Part]) -> Ints:
-        """Return the places of some parts in `parts`."""
+        """Return the indices of some parts in `parts`."""
         return np.array([self._number[part] for part in parts], np.int64)
 
     def set_rate(self, link: str, rate_mbps: float) -> None:
-        """Let the messages of a link be sent at a rate, and wait for each other there."""
+        """Set the rate of a link, at which its messages are sent and wait for each other."""
         number = list(self._problem.fabric.links).index(link)
         for i, part in enumerate(self.parts):
             if isinstance(part, Message) and part.link == link:
@@ -186,38 +188,31 @@ class Meter:
                 self._link[i] = number
 
     def delays(self, evidence: Evidence, link: str, rate_mbps: float) -> dict[Part, Floats]:
-        """Demands of messages, of a link at some rate (see `demands`)."""
+        """Return the demands of messages as if a link had some rate (see `demands`)."""
         usual, joins = self._usual_cost.copy(), self._link.copy()
         self.set_rate(link, rate_mbps)
         self._cost[:] = self._usual_cost
-        found = self._take_apart(self._demands, evidence, evidence.rows)
+        self._take_apart(self._demands, evidence, evidence.rows)
         self._usual_cost[:], self._link[:] = usual, joins
+        found = self._by_part(self._demands)
         return {part: values for part, values in found.items() if isinstance(part, Message)}
 
-    def _take_apart(
-        self, found: PartTimes, evidence: Evidence, rows: WindowRows
-    ) -> dict[Part, Floats]:
-        found.begin(rows, evidence.close_ns - self._patience_ns)
-        for active, _ in groups(evidence.placement):
+    def _take_apart(self, found: PartTimes, evidence: Evidence, rows: WindowRows) -> None:
+        limit_ns = evidence.close_ns - self._patience_ns
+        found.begin(rows, limit_ns)
+        for active in evidence.rows.candidates(limit_ns):
             found.add(active, self._layout(active))
-        return {self.parts[part]: values for part, values in found.by_part().items()}
+
+    def _by_part(self, found: PartTimes) -> dict[Part, Floats]:
+        return {self.parts[number]: values for number, values in found.by_part().items()}
 
     def work_ns(
         self, instants: Instants, placement: NDArray[np.integer], foreign: Mapping[str, float]
     ) -> Ints:
-        """Core time of each job: where it is not known, told by how long the job took.
+        """Return the core time of each job, nanoseconds, shape (n, tasks); -1 if unfinished.
 
-        Parameters
-        ----------
-        placement : int array, shape (n,)
-            Candidate that each cycle, or shadow, went through; -1 for none.
-        foreign : mapping of str to float
-            As in `demands`.
-
-        Returns
-        -------
-        int64 array, shape (n, tasks)
-            -1 for a job that has not completed.
+        Unknown core times are estimated from the duration of the job. `placement` is the candidate
+        of each cycle or shadow, shape (n,), -1 for none. For `foreign` see `demands`.
         """
         ended, known_ns = instants.end_ns >= 0, instants.work_ns
         if known_ns is not None and not (ended & (known_ns < 0)).any():
@@ -234,7 +229,7 @@ class Meter:
         return work_ns if known_ns is None else np.where(known_ns >= 0, known_ns, work_ns)
 
     def _cores_received(self, placement: Placement, foreign: Mapping[str, float]) -> Floats:
-        """Cores that the job of each task has in the mean beside foreign threads."""
+        """Return the average cores of each task's job next to foreign threads."""
         received = []
         for name, task in self._pipeline.tasks.items():
             node, execution = self._problem.fabric.nodes[placement[name]], task.on[placement[name]]
@@ -245,9 +240,10 @@ class Meter:
         return np.array(received)
 
     def _links(self) -> tuple[Ints, Ints]:
-        """By part: the number of the link on which it waits, else -1; whether for repeats, 1 or 0.
+        """Return by part the link on which it waits, else -1, and whether it waits for repeats.
 
-        Messages wait on links that have a rate, or repeat what is lost and keep the order.
+        Messages wait on links with a rate, and on links that repeat lost messages and keep the
+        order.
         """
         links = self._problem.fabric.links.values()
         repeating = [one.name for one in links if one.in_order and one.retransmit_ms is not None]
@@ -261,7 +257,7 @@ class Meter:
         return waits, np.array([name in repeating for name in names], np.int64)
 
     def _layout(self, active: int) -> CyclesLayout:
-        """Return what cycles under a candidate, and their shadows, have for themselves."""
+        """Return the parts of cycles under a candidate, and of their shadows."""
         if active not in self._layouts:
             pipeline, here = self._pipeline, self._placements[active]
             ways = [(here, frozenset(pipeline.tasks))]
@@ -275,7 +271,7 @@ class Meter:
         return self._layouts[active]
 
     def _columns(self, placement: Placement, tasks: Collection[str]) -> list[int]:
-        """Number of the part of each task, then of each flow, that some tasks go through."""
+        """Return the part of each task in `tasks`, then of each flow to them; -1 for others."""
         parts: list[Part | None] = [
             Site(name, placement[name]) if name in tasks else None for name in self._pipeline.tasks
         ]
@@ -291,7 +287,7 @@ def _shares_evenly(node: Node, shared: Collection[str]) -> bool:
 
 
 def cores_on(problem: Problem, node: Node, cores: Callable[[Execution], float]) -> Floats:
-    """Cores of each task's job on the CPU of a node, shape (candidates, tasks); else 0."""
+    """Return the cores of each task's job on a node, shape (candidates, tasks); 0 elsewhere."""
     found = np.zeros((len(problem.candidates), len(problem.pipeline.tasks)))
     for row, placed in zip(found, problem.candidates.values(), strict=True):
         for column, (name, task) in enumerate(problem.pipeline.tasks.items()):
@@ -302,12 +298,12 @@ def cores_on(problem: Problem, node: Node, cores: Callable[[Execution], float]) 
 
 
 def cores_of(node: Node, execution: Execution) -> float:
-    """Cores that a job has while nothing is in its way; of an accelerator one place."""
+    """Return the cores of a job on an idle node; 1, a place, on an accelerator."""
     return float(min(execution.threads, node.cores)) if execution.accelerator is None else 1.0
 
 
 def _cost(problem: Problem, part: Part) -> float:
-    """Time of a job alone over its core time; of a message, nanoseconds to send it."""
+    """Return the time of a job alone per core time, or the nanoseconds to send a message."""
     if isinstance(part, Message):
         return sending_ns(problem, part)
     node = problem.fabric.nodes[part.node]
@@ -315,7 +311,7 @@ def _cost(problem: Problem, part: Part) -> float:
 
 
 def sending_ns(problem: Problem, message: Message, rate_mbps: float | None = None) -> float:
-    """Time to send a message, nanoseconds, at a rate or, where None, the link's own."""
+    """Return the nanoseconds to send a message at a rate [default: its link's]."""
     bytes_of = {(flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows}
     if rate_mbps is None:
         rate_mbps = problem.fabric.links[message.link].rate_mbps
@@ -323,7 +319,7 @@ def sending_ns(problem: Problem, message: Message, rate_mbps: float | None = Non
 
 
 def groups(codes: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:
-    """Yield every code with the rows that have it; all rows as a slice where there is but one."""
+    """Yield every code with its rows; if there is only one code, its rows are a slice."""
     first = int(codes[0])
     if not np.count_nonzero(codes != first):
         yield first, EVERY

@@ -1,4 +1,4 @@
-"""Online: common base of the estimators that learn from windows.
+"""Common base of the estimators that learn from windows.
 
 They keep the measured conditions (`Present`): demands of every part of a cycle, foreign threads of
 every node, rates of links, and nodes that are down. Conditions are as declared until evidence shows
@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -37,7 +36,7 @@ from dwell.model.shadow_plan import by_candidate
 FIRST_STEPS = 6
 #: Largest number of rounds per window for unsure candidates, and steps per round.
 ROUNDS, STEPS = 2, 2
-#: Standard errors between a price difference and the thresholds of a decision that make it sure.
+#: A decision is sure if a price difference is this many standard errors from its thresholds.
 BAND = 2.0
 
 
@@ -50,15 +49,7 @@ class _Declared(NamedTuple):
 
 
 class Online(CellEstimator):
-    """Base of the estimators that learn from windows.
-
-    Attributes
-    ----------
-    shadow_fraction : float, or mapping of str to float
-        Share of cycles sent through each alternative, by active candidate.
-    seed : int
-        Seed of the simulations.
-    """
+    """Base of the estimators that learn from windows; `seed` is the seed of their simulations."""
 
     seed = SEED
 
@@ -120,8 +111,8 @@ class Online(CellEstimator):
         return {**self.__dict__, "_has_changed": True}
 
     @abstractmethod
-    def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
-        """Learn from the measured demands of a window."""
+    def _take_in(self, evidence: Evidence) -> None:
+        """Learn from the demands that the meter has found in a window."""
 
     @abstractmethod
     def _otherwise(self) -> Mapping[Part, Floats]:
@@ -144,7 +135,8 @@ class Online(CellEstimator):
         """Learn from the demands of the last window, once per window."""
         evidence, self._pending = self._pending, None
         if evidence is not None:
-            self._take_in(self._meter.demands(evidence, self._threads), evidence)
+            self._meter.measure(evidence, self._threads)
+            self._take_in(evidence)
 
     @property
     def regimes(self) -> int:
@@ -154,11 +146,14 @@ class Online(CellEstimator):
 
     @property
     def present(self) -> Present:
-        """The measured conditions that differ from the declared ones."""
+        """The measured conditions that differ from the declared conditions."""
         self._take_in_pending()
+        return self._present(self._otherwise())
+
+    def _present(self, otherwise: Mapping[Part, Floats]) -> Present:
         threads = {name: one.beyond for name, one in self._foreign.items() if one.beyond}
         rates_mbps = FrozenDict({link: rate.mbps for link, rate in self._rates.items()})
-        return Present(FrozenDict(self._otherwise()), FrozenDict(threads), self._down, rates_mbps)
+        return Present(FrozenDict(otherwise), FrozenDict(threads), self._down, rates_mbps)
 
     @property
     def _threads(self) -> dict[str, float]:
@@ -174,12 +169,13 @@ class Online(CellEstimator):
         if evidence is not None:
             self._look_at_nodes(evidence, foreign, own, incumbent)
             self._take_in_pending()
-        names = self._names
+        otherwise = self._otherwise()
+        names = self._names(otherwise)
         if self._plays and not names:
             self.revision += 1
         self._plays = bool(names)
         if names and (evidence is not None or self._has_changed):
-            self._play(names)
+            self._play(names, otherwise)
         estimates = self._priced(names, foreign)
         if evidence is not None and names:
             for _ in range(ROUNDS):
@@ -189,7 +185,9 @@ class Online(CellEstimator):
                 self._playing.go_on(self._playing.present, unsure, STEPS)
                 estimates = self._priced(names, foreign)
         for name in names:
-            estimates[name] = replace(estimates[name], error=self._stated_error(name))
+            one, error = estimates[name], self._stated_error(name)
+            known = one.l95_ms, one.violation_rate, one.utilisation, one.cut_from_ms
+            estimates[name] = unchecked_qos(*known, error)
         return estimates
 
     def _stated_error(self, name: str) -> tuple[float, float]:
@@ -221,8 +219,10 @@ class Online(CellEstimator):
                 estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
                 continue
             one_played = played[name]
-            l95_ms, rate = one_played.l95_ms, one_played.violation_rate
-            estimates[name] = QoS(l95_ms, rate, shares[name], one_played.uncut_l95_ms)
+            l95_ms, uncut_ms = one_played.l95_ms, one_played.uncut_l95_ms
+            cut_from_ms = None if uncut_ms == l95_ms else uncut_ms
+            metrics = l95_ms, one_played.violation_rate, shares[name], cut_from_ms
+            estimates[name] = unchecked_qos(*metrics)
         return estimates
 
     def _as_declared(self, name: str) -> _Declared:
@@ -246,20 +246,19 @@ class Online(CellEstimator):
         problem, least = self.problem, self.problem.controller.min_improvement
         objective, here = problem.objective, problem.candidates[incumbent]
         errors = {name: self._sampled(name) for name in names}
-        unsure = set()
+        can_go_on = {name for name in names if errors[name] and not self._playing.is_full(name)}
+        if not can_go_on:
+            return []
+        unsure, cost = set(), self._terms.cost(estimates[incumbent])
         for name, there in problem.candidates.items():
             error = math.hypot(errors.get(name, 0.0), errors.get(incumbent, 0.0))
             if name == incumbent or error <= least / 3:
                 continue
-            gain = self._terms.cost(estimates[incumbent]) - self._terms.cost(estimates[name])
+            gain = cost - self._terms.cost(estimates[name])
             asked = least + objective.weights.switching * hamming(there, here)
             if -BAND * error < gain < asked + BAND * error:
                 unsure |= {name, incumbent}
-        return [
-            name
-            for name in names
-            if name in unsure and errors[name] and not self._playing.is_full(name)
-        ]
+        return [name for name in names if name in unsure & can_go_on]
 
     def _sampled(self, name: str) -> float:
         """Return the standard error of a candidate's J due to few simulated cycles."""
@@ -285,7 +284,7 @@ class Online(CellEstimator):
             self._down, self._has_changed = down, True
 
     def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
-        """Nodes on which nothing has completed since jobs were lost there."""
+        """Yield idle nodes that have lost at least two jobs since their last completed job."""
         limit_ns = evidence.close_ns - self._patience_ns
         if not evidence.rows.unknown(limit_ns)[0]:
             return
@@ -311,10 +310,8 @@ class Online(CellEstimator):
             if len(after) >= 2 and not works:
                 yield node
 
-    @property
-    def _names(self) -> list[str]:
-        """Candidates with a part, node or link that differs from its declaration."""
-        otherwise = self._otherwise()
+    def _names(self, otherwise: Mapping[Part, Floats]) -> list[str]:
+        """Return the candidates with a part, node or link that differs from its declaration."""
         nodes = {name for name, foreign in self._foreign.items() if foreign.beyond} | self._down
         links = {part.link for part in otherwise if isinstance(part, Message)}
         links |= self._rates.keys()
@@ -330,9 +327,9 @@ class Online(CellEstimator):
             )
         ]
 
-    def _play(self, names: list[str]) -> None:
+    def _play(self, names: list[str], otherwise: Mapping[Part, Floats]) -> None:
         """Simulate the affected candidates; start again if the measured conditions changed."""
-        present = self.present
+        present = self._present(otherwise)
         self._count_presents()
         if self._has_changed:
             self._playing.begin(present)

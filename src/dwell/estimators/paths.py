@@ -12,43 +12,30 @@ from dwell.model.pipeline import Flow, Pipeline
 
 
 class Input(NamedTuple):
-    """A flow into a task.
-
-    Parameters
-    ----------
-    column : int
-        Place of the flow in the pipeline.
-    source : int
-        Place of its source among the pipeline's tasks.
-    """
+    """A flow into a task."""
 
     flow: Flow
+    #: Index of the flow in the pipeline.
     column: int
+    #: Index of its source task in the pipeline.
     source: int
 
 
 class Step(NamedTuple):
-    """A task with what its start depends on, looked up once for a pipeline.
-
-    Parameters
-    ----------
-    column : int
-        Place of the task in the pipeline.
-    offset_ms : float
-        Start of a source after the release.
-    sink : bool
-        Whether it has no outputs.
-    """
+    """A task with its inputs, looked up once per pipeline."""
 
     task: str
+    #: Index of the task in the pipeline.
     column: int
+    #: Start of a source after the release.
     offset_ms: float
     inputs: tuple[Input, ...]
+    #: Whether the task has no outputs.
     sink: bool
 
 
 def steps_of(pipeline: Pipeline) -> tuple[Step, ...]:
-    """Return the tasks of a pipeline so that every flow points forward."""
+    """Return the tasks of a pipeline in topological order."""
     place = {name: column for column, name in enumerate(pipeline.tasks)}
     columns = {flow: column for column, flow in enumerate(pipeline.flows)}
     return tuple(
@@ -66,27 +53,18 @@ def steps_of(pipeline: Pipeline) -> tuple[Step, ...]:
 def longest_path(
     steps: Sequence[Step], executed: Sequence[Floats], sent: Sequence[Floats | float]
 ) -> Floats:
-    """Latency of each cycle, in the unit of its parts (paper, eq. 3, for any DAG).
+    """Return the latency of each cycle, shape (n,), in the unit of its parts.
 
-    Parameters
-    ----------
-    steps : sequence of Step
-        Steps of the pipeline (see `steps_of`).
-    executed : sequence of float64 array, shape (n,)
-        Time of every task's job in each cycle, in the pipeline's order.
-    sent : sequence of float64 array of shape (n,), or float
-        Time of every flow's message in each cycle, in the pipeline's order; 0.0 on one node.
-
-    Returns
-    -------
-    float64 array, shape (n,)
+    The equation is eq. 3 of the paper, for any DAG. `executed` has the times of each task's jobs
+    and `sent` the times of each flow's messages, in the pipeline's order and with shape (n,). The
+    time of a message within a node is 0.0.
     """
     finish: dict[int, Floats] = {}
     for step in steps:
         ready: Floats | float = step.offset_ms
         for number, entry in enumerate(step.inputs):
             arrived, message = finish[entry.source], sent[entry.column]
-            # Times are not negative: adding 0.0 changes no bit.
+            # Skip 0.0: the sum would be the same.
             if not isinstance(message, float) or message:
                 arrived = arrived + message
             ready = np.maximum(ready, arrived) if number else arrived

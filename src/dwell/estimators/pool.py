@@ -1,10 +1,10 @@
-"""Pool: what is known of one part of a cycle, as declared or as it was measured.
+"""Pool of known values of one part of a cycle, declared or measured.
 
-The demands of a part are those that the cell file declares until windows show otherwise. What a
-window brings is compared with what is known by Fisher's method of combining tests: of every value
-its place among the known ones, all places together (R. A. Fisher, Statistical Methods for Research
-Workers, 1925). Values of one window are often alike, as those of a scene that changes slowly are;
-how much alike is measured in the undisturbed cell, and the test knows of it.
+The cell file declares the demands of a part; they apply until windows show other values. Fisher's
+method of combining tests compares a window's values with the known values: each value has a place
+(quantile) among them, and one test combines all places (R. A. Fisher, Statistical Methods for
+Research Workers, 1925). Values of one window are often correlated, for example if the scene changes
+slowly; the test allows for their correlation, measured in the undisturbed cell.
 """
 
 from __future__ import annotations
@@ -20,45 +20,29 @@ from dwell.kernels.elementary import cube_root, logarithms
 from dwell.kernels.pools import HeldValues, places
 from dwell.model.number_arrays import Floats
 
-#: Most values that a pool holds, and fewest that it keeps however old they are.
+#: Most values that a pool holds; number of newest values that it keeps at any age.
 LARGEST = 200
 ENOUGH = 12
-#: Deviations from chance that are another regime, and that are none.
+#: Deviations from chance that show another regime; fewer than the second show none.
 SHIFTED, ALIKE = 4.0, 2.0
-#: Mean place of a window's values that is another regime; of all that is held, any is.
+#: A run is of another regime only if the mean place of its values is above this, or below 1 - this.
 MOVED = 0.75
-#: How much more than any stretch of the undisturbed cell another regime must deviate.
+#: Another regime deviates this many times as much, or as long, as any undisturbed stretch.
 MARGIN = 1.2
-#: How much longer than all others a first job takes that is cold: it loads what others find.
+#: A first job is cold (it loads data for later jobs) if it takes this many times as long as others.
 COLD = 1.5
-#: Deviations that are a change within a window, of at least so many values.
+#: Deviations that show a change within a window; fewest values to look for a change.
 CHANGED, LEAST = 5.0, 36
 
 
 class Reference:
-    """Values of a part in the undisturbed cell.
+    """Values of a part in the undisturbed cell, milliseconds; infinite if lost.
 
-    Parameters
-    ----------
-    values : float64 array, shape (n,)
-        In the order of cycles, `block` of them from each stretch; infinite where lost.
-    block : int
-        Cycles of a stretch, whose values may be alike.
-    kept : int, optional
-        Number of first values that are kept as `values`; all where None.
-    patience_ms : float
-        A value beyond counts as lost: at the end of a window it may be.
-
-    Attributes
-    ----------
-    ordered : float64 array
-        All values, ascending; infinite where beyond `patience_ms`.
-    usual : float
-        Median of those that are not lost; infinite where all are.
-    lost : float
-        Share of the values that are lost.
-    likeness : float
-        Mean correlation of two values of a stretch, by their places.
+    `values` are in the order of cycles; only the first `kept` of them stay [default: all]. Values
+    in a stretch of `block` cycles may be correlated; `likeness` is their mean correlation, by
+    places. `ordered` has all values, ascending; values above `patience_ms` are infinite there,
+    because a window may end before they are known. `usual` is the median of the finite values,
+    `lost` the share of infinite values.
     """
 
     __slots__ = (
@@ -94,38 +78,30 @@ class Reference:
         return f"<Reference of {len(self.values)} values, usually {self.usual:g} ms>"
 
     def places(self, values: Floats) -> PlaceSums:
-        """Compare values with those of the undisturbed cell."""
+        """Compare values with the values of the undisturbed cell."""
         return PlaceSums(len(values), *places(self.ordered, values, self._patience_ms))
 
     def holds_nothing(self) -> HeldValues:
-        """Return room for values that are compared with these."""
+        """Return an empty store for values that are compared with these."""
         return HeldValues(self.ordered, self._patience_ms, self.likeness, self.block)
 
     def has_any(self, ordered: Floats) -> bool:
-        """Whether any of some ascending values is between its smallest and its largest."""
+        """Whether any of some ascending values is in the range of the values here."""
         low, high = self.ordered[0], self.ordered[-1]
         return bool(ordered.searchsorted(low, "left") < ordered.searchsorted(high, "right"))
 
     def deviations(self, shift: PlaceSums, cycles: int) -> float:
-        """Deviations from chance of values that are from a stretch of so many cycles."""
+        """Deviations from chance of values from a stretch of `cycles` cycles."""
         return shift.deviations(self.likeness, self._together(shift.size, cycles))
 
     def extremes(self, size: int, cycles: int, deviations: float) -> tuple[float, int]:
-        """Return how far the undisturbed cell deviates by so many deviations and more.
+        """Return how far, and for how long, the undisturbed cell deviates by chance.
 
-        Parameters
-        ----------
-        size : int
-            How many values of each stretch of `cycles` are compared.
-
-        Returns
-        -------
-        largest : float
-            Largest `PlaceSums.largest` of any stretch; 0 where none deviates so.
-        longest : int
-            Cycles for which stretches go on deviating so, at most.
+        Stretches of `cycles` cycles with `size` values count if they deviate by `deviations` or
+        more. The first result is their largest `PlaceSums.largest` (0 without such stretches), the
+        second the most cycles in a row of overlapping or adjacent stretches.
         """
-        # Steps of √2, so that few stretches are looked at.
+        # Sizes are rounded to powers of √2: fewer searches.
         count = math.isqrt(1 << ((size * size).bit_length() - 1))
         key = count, max(cycles // size, 1), deviations
         if key not in self._extremes:
@@ -137,7 +113,7 @@ class Reference:
         largest, longest, span = 0.0, 0, count * every
         if len(values) < span:
             return largest, longest
-        # Of the most values that this stands for, which need deviate least.
+        # The largest size that is rounded to this count; it needs the smallest mean.
         size = math.ceil(count * math.sqrt(2.0))
         together = self._together(size, size * every)
         least = _mean_log(size, deviations * _inflation(self.likeness, together))
@@ -146,7 +122,7 @@ class Reference:
             means = (sums[count:] - sums[:-count]).ravel() / count
             off = np.flatnonzero(means >= least)
             if len(off):
-                # Stretches that overlap, or touch each other, are one.
+                # Overlapping or adjacent stretches are joined.
                 ends = np.flatnonzero(np.diff(off) > span)
                 lengths = off[np.append(ends, -1)] - off[np.append(0, ends + 1)]
                 largest = max(largest, float(means.max()))
@@ -154,7 +130,7 @@ class Reference:
         return largest, longest
 
     def _together(self, size: int, cycles: int) -> float:
-        """How many values of a longer stretch may be alike."""
+        """Number of values that share a block, and so may be correlated."""
         return size * min(self.block / cycles, 1.0)
 
     def _in_time(self, values: Floats) -> Floats:
@@ -164,25 +140,20 @@ class Reference:
 
 
 class Pool:
-    """What is known of one part.
+    """Known values of one part, milliseconds: as declared (`reference`) or measured.
 
-    Parameters
-    ----------
-    reference : Reference
-        What it is as declared.
-    additive : bool
-        Whether what disturbs the part adds to its values (a message) or multiplies them (a job).
+    A disturbance adds to the values of a message (`additive`) and multiplies the values of a job.
     """
 
     __slots__ = ("_alone", "_doubts", "_summary", "additive", "reference", "rows")
 
-    #: The first job of all, if no other was measured in its window; else 0.
+    #: Time of the first job if it was the only one in its window; else 0.
     _alone: float
     _doubts: _Doubt | None
 
     def __init__(self, reference: Reference, additive: bool) -> None:
         self.reference, self.additive = reference, additive
-        #: What is held; the kernel adds to it.
+        #: The held values; the kernel adds to them.
         self.rows = reference.holds_nothing()
         self._alone, self.rows.row.asks = 0.0, not additive
         self._summary = _Summary(np.empty(0), 0.0, 0.0)
@@ -194,12 +165,12 @@ class Pool:
 
     @property
     def held(self) -> Floats:
-        """Values of the present regime, in the order in which they came; one array per change."""
+        """Values of the current regime, oldest first; a new array after each change."""
         return self.rows.values
 
     @property
     def _doubt(self) -> _Doubt | None:
-        """Decisions since which the regime may be over."""
+        """Latest successive decisions that agree with the declared values, if any."""
         return self._doubts
 
     @_doubt.setter
@@ -208,27 +179,27 @@ class Pool:
 
     @property
     def is_declared(self) -> bool:
-        """Whether it is as declared, whatever is held."""
+        """Whether the part counts as declared; it may hold measured values."""
         return bool(self.rows.row.is_declared)
 
     @property
     def measured(self) -> int:
-        """How many of `held` were measured; others have the declared shape."""
+        """Number of measured values in `held`; the others have the declared shape."""
         return int(self.rows.row.measured)
 
     @property
     def last(self) -> int:
-        """The window that the newest measured one is from; 0 before there is any."""
+        """Window of the newest measured value; 0 before the first."""
         return int(self.rows.row.last)
 
     @property
     def touched(self) -> int:
-        """The window in which it last ceased to be as declared, or got a value since; else 0."""
+        """Last window that began or extended the current regime; 0 if as declared."""
         return int(self.rows.row.touched)
 
     @property
     def usual(self) -> float:
-        """Median of the values that are not lost; infinite where all are."""
+        """Median of the finite values; infinite if all values are lost."""
         return self.reference.usual if self.is_declared else middle(self.held)
 
     @property
@@ -238,38 +209,23 @@ class Pool:
 
     @property
     def error_ms(self) -> float:
-        """Standard error of the values' 95th percentile, and no less than of their mean."""
+        """Standard error of the values' 95th percentile or of their mean, the larger of the two."""
         return self._summarised().error_ms
 
     def _summarised(self) -> _Summary:
-        """Return figures of the held values, computed once per change of these."""
+        """Return the summary of the held values, computed once per change."""
         held = self.held
         if self._summary.of is not held:
-            finite = np.isfinite(held)
-            known = np.sort(held[finite])
-            lost = (len(held) - len(known)) / max(len(held), 1)
-            self._summary = _Summary(held, lost, self._error_ms(known))
+            self._summary = _Summary(held, *self.rows.error())
         return self._summary
 
-    def _error_ms(self, known: Floats) -> float:
-        if len(known) < 2:
-            return 0.0
-        count = max(self.measured, 2)
-        # Of few values the deviation is itself hardly known (see `Playing`).
-        few = (count + 1) / (count - 1)
-        apart = known - np.add.reduce(known) / len(known)
-        # As `known.std()` adds up, in a third of the time.
-        deviation = math.sqrt(np.add.reduce(apart * apart) / len(known))
-        of_mean = few * deviation / math.sqrt(count)
-        return max(of_mean, quantile_error(known, share_error(0.05, count)))
-
     def reset(self) -> None:
-        """Return to what is declared."""
+        """Return to the declared values."""
         self.rows.row.is_declared = True
         self._begin(np.empty(0), 0)
 
     def replace(self, values: Floats, window: int) -> None:
-        """Begin another regime with values that nobody measured."""
+        """Begin another regime with values that were not measured."""
         self.rows.row.is_declared = False
         self._begin(values, window)
 
@@ -281,29 +237,23 @@ class Pool:
         cycles: int | None = None,
         tests: float = 1.0,
     ) -> bool:
-        """Take in the values that a window measured; returns whether another regime has begun.
+        """Add the values measured in a window; return whether the regime has changed.
 
-        Parameters
-        ----------
-        values : float64 array, shape (n,)
-            At least one, infinite where it was lost.
-        memory : float
-            Windows after which a value is forgotten.
-        cycles : int, optional
-            Cycles of the window; as many as values where None.
-        tests : float
-            How often any part is compared so in a window of the cell.
+        There is at least one value; lost values are infinite. `window` is the number of the
+        decision; a value is forgotten after `memory` decisions. The values are from `cycles` cycles
+        [default: one per value]. `tests` is the number of such comparisons, of all parts, per
+        window of the cell.
         """
         is_first, self.rows.row.last = not self.last, window
         cycles = len(values) if cycles is None else cycles
-        # A copy: they are overwritten by the next window's.
+        # Copied: the next window overwrites them.
         values = values[:: -(-len(values) // LARGEST)].copy()
         reference = self.reference
         if not self.additive and len(reference.ordered):
             values = self._without_cold(values, is_first)
         declared = reference.places(values)
         if not len(reference.values):
-            # Never came to an end where it is as declared, so that nothing can be told from it.
+            # No declared value to compare with: the part never completed in the undisturbed cell.
             was_declared, self.rows.row.is_declared = self.is_declared, False
             self._add(values, declared, window, memory, cycles)
             return was_declared
@@ -322,7 +272,7 @@ class Pool:
         return False
 
     def _without_cold(self, values: Floats, is_first: bool) -> Floats:
-        """Drop the first job of all if it took far longer than all others."""
+        """Drop the first job if it took much longer than all others (see `COLD`)."""
         usual = COLD * float(self.reference.ordered[-1])
         self.rows.row.asks = False
         if is_first and len(values) > 1:
@@ -335,7 +285,7 @@ class Pool:
 
     @property
     def _run(self) -> _Doubt | None:
-        """Successive decisions whose values are larger, or smaller, than most known before."""
+        """Latest decisions, if any, with mostly larger, or mostly smaller, values than before."""
         row = self.rows.row
         if not row.run_cycles:
             return None
@@ -343,12 +293,12 @@ class Pool:
         return _Doubt(self.rows.before, apart, row.run_cycles)
 
     def _run_before(self, cycles: int) -> _Doubt | None:
-        """Return the run of the decisions before; None if a stretch ends before this decision."""
+        """Return the run so far; None if it would exceed a block with this decision."""
         run = self._run
         return run if run is not None and run.cycles + cycles <= self.reference.block else None
 
     def _run_on(self, run: _Doubt, apart: PlaceSums, cycles: int) -> _Doubt:
-        """Add values to a run, which goes on as long as most are larger, or smaller."""
+        """Add values to a run; end it unless most of its values are larger, or smaller."""
         run = _Doubt(run.before, run.apart + apart, run.cycles + cycles)
         row, self.rows.before = self.rows.row, run.before
         row.run_size, (row.run_larger, row.run_smaller, row.run_places) = (
@@ -358,13 +308,13 @@ class Pool:
         return run
 
     def _since(self, run: _Doubt, values: Floats) -> Floats:
-        """Return the values of a run, of which the newest have not been added."""
+        """Return the values of a run: held values, then `values`, which are not held yet."""
         added = run.apart.size - len(values)
         since = np.concatenate((self.held[max(len(self.held) - added, 0) :], values))
         return since[-LARGEST:]
 
     def _is_over(self, values: Floats, declared: PlaceSums, cycles: int) -> bool:
-        """Whether the regime is over: by all windows since its last value, where few came."""
+        """Whether the regime is over, by the decisions that agree with the declared values."""
         reference = self.reference
         if reference.deviations(declared, cycles) >= ALIKE:
             self._doubt = None
@@ -372,7 +322,7 @@ class Pool:
         doubt = self._doubt or _Doubt(np.sort(self.held), PlaceSums(0, 0.0, 0.0, 0.0), 0)
         apart = doubt.apart + PlaceSums.among(values, doubt.before)
         self._doubt = _Doubt(doubt.before, apart, doubt.cycles + cycles)
-        # Where the regime has usual values, too, a few more of them do not end it.
+        # If the regime itself has values in the declared range, a few more do not end it.
         least = SHIFTED if reference.has_any(doubt.before) else ALIKE
         off = reference.deviations(apart, self._doubt.cycles)
         return off >= least or self._off_declared() < ALIKE
@@ -386,7 +336,7 @@ class Pool:
         cycles: int,
         tests: float,
     ) -> bool:
-        """Whether a window, or all that is held with it, is of another regime."""
+        """Add a window's values; return whether they, or all held values, show another regime."""
         reference = self.reference
         # The chance of a deviation beyond x falls with exp(-x²/2).
         least = least_deviations(tests)
@@ -401,7 +351,7 @@ class Pool:
         return self.has_left(window, cycles, least)
 
     def has_left(self, window: int, cycles: int, least: float) -> bool:
-        """Whether all that is held is of another regime, once a window has been added to it."""
+        """Whether all held values, with the newest window, show another regime."""
         row = self.rows.row
         if self._off_declared() < least:
             row.lasting = 0
@@ -414,14 +364,14 @@ class Pool:
         return True
 
     def follow(self, witness: Pool, window: int) -> None:
-        """Be otherwise as another part is: so many times its usual values, or so much more."""
+        """Apply the slowdown of another part, or its extra delay and losses, to this part."""
         if witness.is_declared:
             self.reset()
         elif max(self.reference.usual, witness.reference.usual) < math.inf:
             self.replace(self._as(witness), window)
 
     def _as(self, witness: Pool) -> Floats:
-        """The declared values, with the extra delay and the losses, or the slowdown, of another."""
+        """Return the declared values with another part's slowdown, or extra delay and losses."""
         values, usual, now = self.reference.values, witness.reference.usual, witness.usual
         if not self.additive:
             return values * (now / usual) if usual > 0 and now < math.inf else values
@@ -435,19 +385,19 @@ class Pool:
         return values
 
     def moved(self, to: float) -> Floats:
-        """The declared values, stretched or shifted so that their median is another."""
+        """Return the declared values, scaled (jobs) or shifted (messages) to another median."""
         values, usual = self.reference.values, self.reference.usual
         if self.additive or usual <= 0:
             return np.maximum(values + (to - usual), 0.0)
         return values * (to / usual)
 
     def _off_declared(self) -> float:
-        """Deviations by which all that is held is not as declared."""
+        """Deviations from chance of all held values, against the declared values."""
         return self.reference.deviations(self._shift, self._span)
 
     @property
     def _span(self) -> int:
-        """Cycles of the windows that what is held is from."""
+        """Number of cycles in the windows of the held values."""
         return max(int(self.rows.row.cycles), 1)
 
     @property
@@ -456,7 +406,7 @@ class Pool:
         return PlaceSums(row.size, row.larger, row.smaller, row.places)
 
     def _begin_anew(self, values: Floats, window: int, cycles: int) -> None:
-        """Begin another regime; where its values are few, with the declared shape."""
+        """Begin another regime; add values of the declared shape if it has fewer than `ENOUGH`."""
         values = values[newest(values) :]
         new = middle(values)
         few = len(values) < ENOUGH and max(new, self.reference.usual) < math.inf
@@ -472,30 +422,26 @@ class Pool:
     def _add(
         self, values: Floats, shift: PlaceSums, window: int, memory: float, cycles: int
     ) -> None:
-        """Add values, and drop the oldest: what is forgotten, and what is beyond `LARGEST`."""
+        """Add values; drop forgotten values, and the oldest beyond `LARGEST`."""
         self.rows.add(values, shift.sums, window, memory, cycles)
 
 
 @dataclass(frozen=True, slots=True)
 class PlaceSums:
-    """How values lie among known ones.
+    """Sums over values by their place p, from 0 to 1, among known values."""
 
-    Parameters
-    ----------
-    size : int
-        How many they are.
-    larger, smaller, places : float
-        Sums of -log(1 - p), of -log(p), and of p, their places among the known ones.
-    """
-
+    #: Number of values.
     size: int
+    #: Sum of -log(1 - p).
     larger: float
+    #: Sum of -log(p).
     smaller: float
+    #: Sum of p.
     places: float
 
     @classmethod
     def among(cls, values: Floats, known: Floats) -> PlaceSums:
-        """Compare values with known ones, which ascend."""
+        """Compare values with known values, in ascending order."""
         return cls(len(values), *places(known, values))
 
     def __add__(self, other: PlaceSums) -> PlaceSums:
@@ -508,60 +454,47 @@ class PlaceSums:
 
     @property
     def sums(self) -> tuple[float, float, float]:
-        """The sums alone."""
+        """The three sums, without the size."""
         return self.larger, self.smaller, self.places
 
     @property
     def largest(self) -> float:
-        """Mean of -log(1 - p), or of -log(p) where it is larger."""
+        """Mean of -log(1 - p) or of -log(p), the larger of the two."""
         return max(self.larger, self.smaller, 0.0) / self.size
 
     @property
     def is_large(self) -> bool:
-        """Whether most of the values are larger, or smaller, than most known ones."""
+        """Whether most of the values are larger, or smaller, than most known values."""
         return not 1 - MOVED <= self.places / self.size <= MOVED
 
     def deviations(self, likeness: float, together: float | None = None) -> float:
-        """Deviations from chance by which the values are larger, or smaller, than the known ones.
+        """Deviations from chance by which the values are larger, or smaller, than known values.
 
-        Parameters
-        ----------
-        likeness : float
-            Mean correlation of two values of a window.
-        together : float, optional
-            How many of them are of one stretch; all where None.
+        `together` values [default: all] are from one stretch, with mean correlation `likeness`.
         """
         size = self.size
         if not size:
             return 0.0
-        # Of a sum of exponential values, by the cube root of its mean (Wilson and Hilferty).
+        # The cube root of a mean of exponential values is nearly normal (Wilson and Hilferty).
         part = 1.0 / (9.0 * size)
         off: float = (cube_root(self.largest) - (1.0 - part)) / math.sqrt(part)
         return off / _inflation(likeness, together or size)
 
 
 def _inflation(likeness: float, together: float) -> float:
-    """By how much the mean of so many values deviates more than that of independent ones."""
+    """Factor by which correlation increases the standard deviation of a mean."""
     return math.sqrt(1.0 + max(together - 1.0, 0.0) * likeness)
 
 
 def _mean_log(size: int, deviations: float) -> float:
-    """Return the `PlaceSums.largest` of so many independent values with so many deviations."""
+    """Return the `PlaceSums.largest` of `size` independent values at `deviations`."""
     part = 1.0 / (9.0 * size)
     root = 1.0 - part + deviations * math.sqrt(part)
     return float(root * root * root)
 
 
 class _Summary(NamedTuple):
-    """Figures of the values that a pool holds.
-
-    Parameters
-    ----------
-    of : float64 array
-        The values.
-    lost, error_ms : float
-        See `Pool`.
-    """
+    """Summary of the held values `of` (see `Pool`)."""
 
     of: Floats
     lost: float
@@ -569,20 +502,13 @@ class _Summary(NamedTuple):
 
 
 class _Doubt(NamedTuple):
-    """Successive decisions whose values are compared with known ones together.
+    """Successive decisions whose values are tested together."""
 
-    Parameters
-    ----------
-    before : float64 array
-        What was known before them, ascending.
-    apart : PlaceSums
-        Their values among those.
-    cycles : int
-        Cycles that they are from.
-    """
-
+    #: Values known before these decisions, ascending.
     before: Floats
+    #: Places of the decisions' values among `before`.
     apart: PlaceSums
+    #: Number of cycles of these decisions.
     cycles: int
 
 
@@ -591,23 +517,11 @@ def share_error(share: float, count: int) -> float:
     return math.sqrt(share * (1.0 - share) / count)
 
 
-def quantile_error(ordered: Floats, off: float) -> float:
-    """Return the error of the 95th percentile of ascending values whose place has an error.
-
-    The values at the places two errors off are the limits (Woodruff, DOI 10.2307/2280781); half
-    the distance to the farther one is the error.
-    """
-    last = len(ordered) - 1
-    usual: float = ordered.item(round(0.95 * last))
-    low: float = ordered.item(max(round((0.95 - 2 * off) * last), 0))
-    high: float = ordered.item(min(round((0.95 + 2 * off) * last), last))
-    return max(high - usual, usual - low) / 2
-
-
 def newest(values: Floats) -> int:
-    """Return the first of a window's values since its last change, if there was one; else 0.
+    """Return the index of the first value after a change within a window; 0 without a change.
 
-    The quarters before and after a change differ in their ranks; infinite values are the largest.
+    Changes after one, two or three quarters of the window are tried, by the difference of the mean
+    ranks before and after; infinite values have the largest ranks.
     """
     count = len(values)
     if count < LEAST:
@@ -617,14 +531,14 @@ def newest(values: Floats) -> int:
     ends = np.array([count // 4, count // 2, 3 * count // 4])
     before = np.cumsum(ranks)[ends - 1]
     gap = before / ends - (ranks.sum() - before) / (count - ends)
-    # Twice the ranks have four times the variance of a uniform distribution over them.
+    # `ranks` are twice the ranks, uniform from 0 to 2n, with variance n²/3.
     off = np.abs(gap) / (count * np.sqrt((1 / ends + 1 / (count - ends)) / 3))
     at = int(off.argmax())
     return int(ends[at]) if off[at] >= CHANGED else 0
 
 
 def _likeness(ordered: Floats, values: Floats, block: int) -> float:
-    """Mean correlation of two values of a stretch: by how much their mean place varies more."""
+    """Mean correlation of two values of a stretch, from the variance of the stretches' means."""
     stretches = len(values) // block
     if stretches < 2 or block < 2 or ordered[0] == ordered[-1]:
         return 0.0
@@ -638,19 +552,19 @@ def _likeness(ordered: Floats, values: Floats, block: int) -> float:
 
 
 def _logs(ordered: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """-log(1 - p) and -log(p) of values, by their places p among known ones."""
+    """Return -log(1 - p) and -log(p) of values by their places p among known values."""
     left, right = ordered.searchsorted(values, "left"), ordered.searchsorted(values, "right")
     places = (left + right + 1) / (2 * len(ordered) + 2)
     return -logarithms(1.0 - places), -logarithms(places)
 
 
 def middle(values: Floats) -> float:
-    """Median of the values that are not lost; infinite where all are."""
+    """Return the median of the finite values; infinite if all values are lost."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if len(finite) else math.inf
 
 
 @cache
 def least_deviations(tests: float) -> float:
-    """Deviations that are another regime, where parts are compared so many times in a window."""
+    """Deviations that show another regime if a window has `tests` comparisons of parts."""
     return math.sqrt(SHIFTED * SHIFTED + 2.0 * float(logarithms(np.array([tests]))[0]))

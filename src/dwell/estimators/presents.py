@@ -1,9 +1,9 @@
-"""Playing: what candidates come to under a present, by the kernel.
+"""Simulate candidates under measured conditions, with the kernel.
 
-A *present* is the undisturbed cell but for what windows have shown to be otherwise: demands of some
-parts, foreign threads of some nodes, nodes that are down. The kernel plays the candidates that have
-anything of it window after window, on common draws, each from where it was left; what has been
-played under a present adds up until another one begins.
+Measured conditions (`Present`) are the differences from the undisturbed cell that windows have
+shown: demands of some parts, foreign threads of some nodes, rates of links, nodes that are down.
+All candidates are simulated on the same realisation. Each simulation continues where it stopped,
+and its newest steps are averaged until the conditions change.
 """
 
 from __future__ import annotations
@@ -12,69 +12,60 @@ import math
 from collections import deque
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from operator import sub
 from typing import NamedTuple
 
 import numpy as np
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, cores_of, parts_of
-from dwell.estimators.pool import Reference, quantile_error
+from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, most_windows, prices_of
 from dwell.estimators.sent_shadows import SentShadows, stamps_of
 from dwell.estimators.slow_processes import slow_processes, unseen_error
 from dwell.estimators.spans import patience_ns
-from dwell.kernels.advance import logged_window, play
+from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import Arrays, CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import LAST_NS
-from dwell.kernels.elementary import moments
-from dwell.kernels.pools import fill
+from dwell.kernels.pools import TimesRow, fill
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegments, NodeChange, NodeChanges, Realisation
 from dwell.kernels.rows import Rows, row_types
+from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
 from dwell.model.fabric import Node
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowFraction
 
-#: Longer windows are played as windows of so many cycles, and shorter ones some at a time.
+#: Longest simulated window, cycles; cycles of a step, which has at least one window.
 LONGEST_WINDOW, STEP = 1000, 100
-#: How many cycles are drawn before they are played again, and the fewest windows of them.
+#: Sampled cycles, which repeat when all are simulated; fewest windows of these cycles.
 DRAWN, FEWEST = 2400, 4
-#: Steps that a candidate's price is of at most; and while demands of the present change.
+#: Most steps in a candidate's price; the same while the measured demands change.
 KEPT, RECENT = 24, 6
-#: Largest correlation of successive steps; more would be a drift.
+#: Limit of the correlation of successive steps; more would be a drift.
 MOST_ALIKE = 0.9
-#: Cycles after those of a step that may have been released when it ends.
+#: Number of cycles after a step that may already be released when it ends.
 BEYOND = 64
-#: Of a fraction of a thread, what is neither none nor a whole one.
+#: A fraction of a thread below this counts as 0, above 1 - this as 1.
 FRACTION = 0.15
-#: Most foreign threads that a node may have beyond those that are declared.
+#: Most foreign threads of a node in addition to the declared threads.
 MOST_THREADS = 64
 
 
 @dataclass(frozen=True, slots=True)
 class Present:
-    """What is not as the cell declares it.
+    """Measured conditions: all that differs from the declared cell."""
 
-    Parameters
-    ----------
-    demands : mapping of Part to float64 array
-        Values of a part in the order in which they are to be met, milliseconds, infinite where a
-        message is lost; those of a job are times alone on its node, those of a message delays.
-    threads : mapping of str to float
-        Foreign threads of a node beyond those of its bursts; negative: those of its bursts in the
-        mean, and so many less, all the time.
-    down : frozenset of str
-        Nodes that are down.
-    rates_mbps : mapping of str to float
-        Rates of links.
-    """
-
+    #: Milliseconds, in the order of cycles: times of jobs alone on their node, or delays of
+    #: messages, infinite if lost.
     demands: Mapping[Part, Floats] = field(default_factory=FrozenDict)
+    #: Foreign threads of a node in addition to its bursts. A negative number is added to the mean
+    #: number of declared threads, which is then constant.
     threads: Mapping[str, float] = field(default_factory=FrozenDict)
+    #: Nodes that are down.
     down: frozenset[str] = frozenset()
+    #: Rates of links.
     rates_mbps: Mapping[str, float] = field(default_factory=FrozenDict)
 
     def __repr__(self) -> str:
@@ -84,7 +75,7 @@ class Present:
 
 
 class PlayedPrice(NamedTuple):
-    """What a candidate came to, in the mean over windows, with standard errors; see `Price`."""
+    """Means over the simulated windows of a candidate, with standard errors (see `Price`)."""
 
     l95_ms: float
     l95_error_ms: float
@@ -94,50 +85,47 @@ class PlayedPrice(NamedTuple):
     own: Mapping[str, float]
 
 
-class _Step(NamedTuple):
-    """What a step has shown in the mean, and what the same windows show as declared."""
-
-    l95_ms: float
-    declared_ms: float
-    uncut_ms: float
-    violation_rate: float
-    declared_rate: float
-    own: Floats
-    latency_ns: Ints
-
-
 class _Twin:
-    """A candidate that is played beside the cell, and the steps that it has shown."""
+    """The simulation of a candidate, and the results of its steps."""
 
-    def __init__(self, first: Arrays, index: int, shadows: SentShadows | None) -> None:
+    def __init__(
+        self, first: Arrays, index: int, shadows: SentShadows | None, resources: int
+    ) -> None:
         self.arrays = first.copy()
         self.arrays.replace(stamps=stamps_of(first, index, shadows))
-        #: The cycle that it goes on from.
+        #: Next cycle to simulate.
         self.cursor = 0
-        self.steps: deque[_Step] = deque(maxlen=KEPT)
+        #: Means of each step, oldest first: L95 (ms) and V_D, each followed by the mean of the same
+        #: windows as declared; uncut L95; the cell's own share of every resource.
+        self.steps = Steps(KEPT, PAIRS + 1 + resources)
+        #: Latencies of the cycles of each step.
+        self.latency_ns: deque[Ints] = deque(maxlen=KEPT)
         self.price: PlayedPrice | None = None
+
+    def add(self, means: Sequence[float], latency_ns: Ints) -> None:
+        """Add a step; drop the oldest beyond `KEPT`."""
+        self.steps.add(means)
+        self.latency_ns.append(latency_ns)
+
+    def keep(self, most: int) -> None:
+        """Keep the newest `most` steps."""
+        self.steps.keep(most)
+        while len(self.latency_ns) > most:
+            self.latency_ns.popleft()
 
 
 @dataclass(frozen=True, slots=True)
 class Declared:
-    """The undisturbed cell, as `Playing` plays it.
-
-    Parameters
-    ----------
-    realisation : Realisation
-        What is drawn of it.
-    references : mapping of Part to Reference
-        The demands of every part, as windows would show them.
-    l95_ms, violation_rate : mapping of str to float64 array, shape (windows,)
-        What every window shows under each candidate.
-    shadows : SentShadows, optional
-        Shadow jobs that it is played with, where they matter.
-    """
+    """The undisturbed cell, as `Playing` simulates it."""
 
     realisation: Realisation
+    #: Demands of every part, as windows would measure them.
     references: Mapping[Part, Reference]
+    #: L95 of every window, by candidate.
     l95_ms: Mapping[str, Floats]
+    #: V_D of every window, by candidate.
     violation_rate: Mapping[str, Floats]
+    #: The simulated shadow jobs, if they slow any candidate down.
     shadows: SentShadows | None = None
 
     def __repr__(self) -> str:
@@ -145,22 +133,11 @@ class Declared:
 
 
 class Playing:
-    """Plays the candidates of a problem.
+    """Simulation of the candidates of a problem under measured conditions.
 
-    Parameters
-    ----------
-    seed : int
-        Seed of what is as declared.
-    shadow_fraction : float, or mapping of str to float
-        Share of the cycles that are also sent through each alternative, by the candidate that is
-        played.
-
-    Attributes
-    ----------
-    prices : mapping of str to Price
-        What candidates come to as declared.
-    cycles : int
-        Cycles that have been played of all candidates since the start.
+    `seed` is the seed of the declared realisation; `shadow_fraction` is the share of cycles that
+    are also sent through each alternative, by simulated candidate. `prices` are the prices as
+    declared; `cycles` counts the simulated cycles of all candidates.
     """
 
     def __init__(
@@ -170,9 +147,9 @@ class Playing:
         self.declared = declared_of(problem, seed, shadow_fraction)
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
         self._window = min(problem.window_cycles, LONGEST_WINDOW)
-        self._names = tuple(problem.candidates)
+        self._names, self._resources = tuple(problem.candidates), tuple(problem.fabric.resources)
         self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
-        #: Standard deviations of what steps show as declared: L95 (ms) and V_D.
+        #: Standard deviations of a step's L95 (ms) and V_D, as declared.
         self._usual = {
             name: [
                 float(windows[name][1:].std()) / math.sqrt(self._step)
@@ -182,15 +159,15 @@ class Playing:
         }
         self.cycles = 0
         self._twins: dict[str, _Twin] = {}
-        #: Demands that cycles have been filled with.
+        #: Demands in the tables of the cycles.
         self._filled: Mapping[Part, Floats] = {}
 
     def __reduce__(self) -> tuple[type[Playing], tuple[Problem, int, ShadowFraction]]:
-        # The kernel's tables have addresses; a copy begins anew.
+        # The kernel's tables have addresses; a copy starts without simulations.
         return Playing, (self.problem, self._seed, self._shadow_fraction)
 
     def begin(self, present: Present) -> None:
-        """Begin another present: what was played before does not count any more."""
+        """Begin with other measured conditions; discard the results of earlier steps."""
         if not self._twins:
             self._lay_out()
         self.present = present
@@ -201,27 +178,23 @@ class Playing:
         self._set_links(present)
         self._set_losses(present)
         for twin in self._twins.values():
-            twin.steps.clear()
+            twin.keep(0)
             twin.arrays.replace(changes=changes)
         self._restart()
 
     def go_on(
         self, present: Present, names: Collection[str], steps: int = 1, *, has_grown: bool = False
     ) -> None:
-        """Play some candidates on; the present has the same parts, maybe with newer values.
+        """Simulate more steps of some candidates; the measured conditions have the same parts.
 
-        Parameters
-        ----------
-        has_grown : bool
-            Whether values are newer: prices are then of the most recent steps.
+        If `has_grown`, the parts have newer values, and prices use only the most recent steps.
         """
         self.present = present
         if has_grown:
             self._set_losses(present)
             self._fill(max(twin.cursor for twin in self._twins.values()))
             for name in names:
-                while len(self._twins[name].steps) >= RECENT:
-                    self._twins[name].steps.popleft()
+                self._twins[name].keep(RECENT - 1)
         for _ in range(steps):
             last = max(self._twins[name].cursor for name in names)
             if last + self._step * self._window > self._real.cycles:
@@ -246,85 +219,76 @@ class Playing:
         if first < last:
             tables, stretch = twin.arrays.tables, slice(first, last)
             seen = tables.seen[0, stretch]
-            twin.steps.append(
-                _Step(
-                    _mean(seen["l95_ms"]),
-                    _mean(self.declared.l95_ms[name][stretch]),
-                    _mean(seen["uncut_ms"]),
-                    _mean(seen["missed"]) / self._window,
-                    _mean(self.declared.violation_rate[name][stretch]),
-                    _mean_shares(tables.shares[0, stretch, 1]),
-                    tables.latency_ns[0, first * self._window : twin.cursor].copy(),
-                )
+            means = (
+                _mean(seen["l95_ms"]),
+                _mean(self.declared.l95_ms[name][stretch]),
+                _mean(seen["missed"]) / self._window,
+                _mean(self.declared.violation_rate[name][stretch]),
+                _mean(seen["uncut_ms"]),
+                *_mean_shares(tables.shares[0, stretch, 1]),
             )
+            twin.add(means, tables.latency_ns[0, first * self._window : twin.cursor].copy())
         twin.price = None
         self.cycles += self._step * self._window
 
     def played(self, name: str) -> PlayedPrice:
-        """What a candidate has come to under the present."""
+        """Return the price of a candidate under the measured conditions."""
         twin = self._twins[name]
         if twin.price is None:
             twin.price = self._price(name, twin.steps)
         return twin.price
 
     def deviations(self, name: str) -> tuple[float, float]:
-        """Return standard deviations of one window: of its L95, milliseconds, and its V_D."""
+        """Return the standard deviations of one window's L95, milliseconds, and V_D."""
         price = self.prices[name]
         usual = price.l95_deviation_ms, price.violation_deviation
-        steps = self._twins[name].steps if self._twins else ()
-        if len(steps) < 2:
+        if not self._twins or len(steps := self._twins[name].steps) < 2:
             return usual
-        shown = np.array([[step.l95_ms, step.violation_rate] for step in steps])
-        # Of few values the deviation is itself hardly known.
+        shown = np.ascontiguousarray(steps.table[:, :PAIRS:2])
+        # A deviation from few values is itself uncertain.
         few = (len(steps) + 1) / (len(steps) - 1) * math.sqrt(self._step)
         l95_ms, rate = (few * shown.std(axis=0)).tolist()
         return max(l95_ms, usual[0]), max(rate, usual[1])
 
     def tail_error_ms(self, name: str, off: float) -> float:
-        """Return the error of a candidate's L95 by the error of the share of lost cycles."""
-        latency_ns = np.concatenate([step.latency_ns for step in self._twins[name].steps])
-        return quantile_error(np.sort(np.minimum(latency_ns / 1e6, self._censor_ms)), off)
+        """Return the error of L95 (ms) that an error `off` of the share of lost cycles causes."""
+        latency_ns = np.concatenate(self._twins[name].latency_ns)
+        return tail_error_ms(latency_ns, self._censor_ms, off)
 
-    def _price(self, name: str, steps: Collection[_Step]) -> PlayedPrice:
-        l95, declared_l95, uncut, rates, declared_rates, own, _ = zip(*steps, strict=True)
-        known = self.prices[name]
+    def _price(self, name: str, steps: Steps) -> PlayedPrice:
+        count, known = len(steps), self.prices[name]
+        l95, rates, (uncut, *own) = steps.sums()
         l95_ms, l95_error_ms = _estimated(
-            l95,
-            declared_l95,
-            known.l95_ms,
-            known.l95_error_ms,
-            usual=self._usual[name][0],
+            l95, count, known.l95_ms, known.l95_error_ms, usual=self._usual[name][0]
         )
-        count = len(steps)
         violation_rate, violation_error = _estimated(
             rates,
-            declared_rates,
+            count,
             known.violation_rate,
             known.violation_error,
             usual=self._usual[name][1],
             cycles=count * self._step * self._window,
         )
-        l95_ms, shares = min(l95_ms, self._censor_ms), sum(own) / count
+        l95_ms = min(l95_ms, self._censor_ms)
         return PlayedPrice(
             l95_ms,
             l95_error_ms,
-            max(sum(uncut) / count, l95_ms),
+            max(uncut / count, l95_ms),
             min(violation_rate, 1.0),
             violation_error,
-            FrozenDict(zip(self.problem.fabric.resources, shares.tolist(), strict=True)),
+            FrozenDict(zip(self._resources, [share / count for share in own], strict=True)),
         )
 
     def is_full(self, name: str) -> bool:
-        """Whether the price of a candidate is of as many windows as it ever is."""
-        steps = self._twins[name].steps
-        return len(steps) == steps.maxlen
+        """Whether a candidate's price has the most steps (`KEPT`)."""
+        return len(self._twins[name].steps) == KEPT
 
     def _lay_out(self) -> None:
         problem = _with_short_windows(self.problem)
         declared, shadows = self.declared.realisation, self.declared.shadows
-        # Every node has a change to begin with, so that any may be otherwise from then on.
+        # Every node has a change at 0, which measured conditions may replace.
         begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
-        # Those whose jobs take turns need room for the most that there may be: later than ever.
+        # Nodes with a quota in ticks need room for the most threads; this change never happens.
         ends = [
             NodeChange(LAST_NS, name, _most_threads(node), False)
             for name, node in problem.fabric.nodes.items()
@@ -332,7 +296,7 @@ class Playing:
         ]
         changes = NodeChanges.of([*begins, *declared.node_changes, *ends])
         self._real = replace(_with_own_demands(declared), node_changes=changes)
-        #: What is declared of the cycles, and of their shadows, with what is played in its place.
+        #: Declared and simulated realisation of the cycles, then of their shadows.
         self._replaced, sent = [(declared, self._real)], None
         if shadows is not None:
             sent = _with_own_demands(shadows.realisation)
@@ -344,22 +308,23 @@ class Playing:
         self._declared_rates, self._declared_segments = tables.rates.copy(), tables.segments.copy()
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
-        self._rows: dict[Part, list[Ints]] = {}
+        self._rows: dict[Part, list[TimesRow]] = {}
         for _, played in self._replaced:
             for site, row in zip(played.sites, played.exec_ns, strict=True):
-                self._rows.setdefault(Site(*site), []).append(row)
+                self._rows.setdefault(Site(*site), []).append(TimesRow.of(row))
             for hop, row in zip(played.hops, played.delay_ns, strict=True):
-                self._rows.setdefault(Message(*hop), []).append(row)
+                self._rows.setdefault(Message(*hop), []).append(TimesRow.of(row))
         self._stretched: dict[Part, float] = {
             Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
         }
         self._hops = {Message(*hop): number for number, hop in enumerate(self._real.hops)}
         rows = zip(problem.fabric.links, tables.links.tolist(), strict=False)
         self._segments = {link: slice(*row[-2:]) for link, row in rows}
-        self._twins = {name: _Twin(self._first, i, shadows) for i, name in enumerate(self._names)}
+        of = shadows, len(self._resources)
+        self._twins = {name: _Twin(self._first, i, *of) for i, name in enumerate(self._names)}
 
     def _restore(self) -> None:
-        """Go back to what is declared."""
+        """Restore the declared values."""
         for declared, played in self._replaced:
             np.copyto(played.exec_ns, declared.exec_ns)
             np.copyto(played.delay_ns, declared.delay_ns)
@@ -368,10 +333,10 @@ class Playing:
         tables.layers[:] = self._declared_layers
 
     def _fill(self, since: int) -> None:
-        """Let the cycles from one on meet the present's demands."""
+        """Set the measured demands of the cycles from `since` on, except those just released."""
         begin = since + BEYOND if since else 0
         for part, values in self.present.demands.items():
-            # The same values have been filled in before, up to the last cycle.
+            # An earlier call has set the same values, up to the last cycle.
             if since and self._filled.get(part) is values:
                 continue
             stretched = self._stretched.get(part, 1.0)
@@ -379,7 +344,7 @@ class Playing:
         self._filled = self.present.demands
 
     def _set_links(self, present: Present) -> None:
-        """Set the rates of links, and that measured delays are all that there is."""
+        """Set measured rates of links; measured delays include the extra delays of their link."""
         tables = self._first.tables
         for part in present.demands:
             if part in self._hops:
@@ -389,19 +354,19 @@ class Playing:
             tables.rates["rate_mbps"][self._segments[link]] = mbps
 
     def _set_losses(self, present: Present) -> None:
-        """Set what links lose."""
+        """Set the share of messages that each link loses."""
         tables, links = self._first.tables, self.problem.fabric.links
         for link, share in _lost(present).items():
             mine = self._segments[link]
             if links[link].retransmit_ms is None:
                 tables.rates["loss"][mine] = share
             else:
-                # Attempts that were lost are in the delays, and what never came was held back.
+                # Delays include lost attempts. A link that loses half its messages is down.
                 tables.rates["loss"][mine] = 0.0
                 tables.segments["is_down"][mine] = share >= 0.5
 
     def _changes(self, present: Present) -> Rows:
-        """Return the changes of nodes with the present's foreign threads."""
+        """Return the changes of nodes under measured conditions."""
         rows = self._declared_changes
         if not present.threads and not present.down:
             return rows
@@ -409,7 +374,7 @@ class Playing:
 
 
 def _changed(rows: Rows, nodes: Sequence[str], present: Present, release_ns: Ints) -> Rows:
-    """Return changes of nodes with the foreign threads and the outages of a present."""
+    """Return the changes of nodes with measured foreign threads and outages."""
     is_other = np.array([name in present.threads or name in present.down for name in nodes])
     pieces = [rows[~is_other[rows["node"]]]]
     for i in np.flatnonzero(is_other).tolist():
@@ -422,7 +387,7 @@ def _changed(rows: Rows, nodes: Sequence[str], present: Present, release_ns: Int
 
 
 def _lost(present: Present) -> dict[str, float]:
-    """Share of the messages that each link loses of which a present knows something."""
+    """Return the measured share of lost messages, by link: the mean of its flows."""
     lost: dict[str, list[float]] = {}
     for part, values in present.demands.items():
         if isinstance(part, Message):
@@ -432,7 +397,7 @@ def _lost(present: Present) -> dict[str, float]:
 
 
 def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
-    """Return a node's changes with more threads, or fewer, a fraction as a share of periods."""
+    """Return a node's changes with more or fewer threads; a fraction is a share of periods."""
     at_ns, stress = rows["at_ns"], rows["stress"]
     if threads < 0.0:
         spans = np.diff(np.append(at_ns, max(int(release_ns[-1]), int(at_ns[-1]))))
@@ -449,7 +414,7 @@ def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
         return changed
     release_ns = release_ns[:-1]
     all_ns = np.sort(np.concatenate((at_ns, release_ns[release_ns > at_ns[0]])))
-    # Both ascend, so that this takes a tenth of the time of `np.unique`, which hashes.
+    # Faster than `np.unique`, which hashes, by a factor of ten: the values are sorted.
     all_ns = all_ns[np.append(True, all_ns[1:] != all_ns[:-1])]
     cycle = np.searchsorted(release_ns, all_ns, side="right")
     more = np.floor((cycle + 1) * rest) - np.floor(cycle * rest)
@@ -462,71 +427,61 @@ def with_threads(rows: Rows, threads: float, release_ns: Ints) -> Rows:
 
 
 def _estimated(
-    steps: Sequence[float],
-    declared: Sequence[float],
+    steps: SeriesSums,
+    count: int,
     known: float,
     known_error: float,
     *,
     usual: float,
     cycles: int | None = None,
 ) -> tuple[float, float]:
-    """Mean of what steps show, with its standard error.
+    """Return the mean over `count` steps, with its standard error.
 
-    They are on the draws of others as declared, whose mean is known: where the difference between
-    the two varies less than what is shown, it is the difference that is averaged (a control
-    variate; DOI 10.1287/opre.30.5.961).
-
-    Parameters
-    ----------
-    declared : sequence of float
-        What the same steps show as declared.
-    known, known_error : float
-        Mean as declared, with its standard error.
-    usual : float
-        Standard deviation of a step as declared: few steps may have seen less than there is.
-    cycles : int, optional
-        How many there are, where it is a share of them that is estimated.
+    The same realisation is also simulated as declared; longer simulations give its expected value
+    `known`, with error `known_error`. If the difference between the two varies less than the
+    measured conditions do, its mean is added to `known` (a control variate; DOI
+    10.1287/opre.30.5.961). `usual` is the standard deviation of a step as declared, since few steps
+    may vary too little; `cycles` is the number of cycles if the mean is a share of cycles.
     """
-    differences = list(map(sub, steps, declared))
-    if not any(differences):
+    mean, squares, products, more, more_squares, more_products, apart = steps
+    if not apart:
         return known, known_error
-    mean, error = _mean_and_error(steps, usual)
-    more, more_error = _mean_and_error(differences)
+    error = _error(count, mean, squares, products, usual)
+    more_error = _error(count, more, more_squares, more_products)
     if cycles is not None:
         error = max(error, unseen_error(mean, cycles))
-        differing = sum(map(abs, differences)) / len(steps)
-        more_error = max(more_error, unseen_error(differing, cycles))
+        more_error = max(more_error, unseen_error(apart / count, cycles))
     more_error = math.hypot(more_error, known_error)
     return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
 
 
 def _mean(windows: Floats | Ints) -> float:
-    # Windows of a usual length are played one by one.
+    # Most steps are one window.
     return float(windows.item() if len(windows) == 1 else windows.mean())
 
 
-def _mean_shares(windows: Floats) -> Floats:
-    mean: Floats = windows[0].copy() if len(windows) == 1 else windows.mean(axis=0)
-    return mean
+def _mean_shares(windows: Floats) -> list[float]:
+    mean: Floats = windows[0] if len(windows) == 1 else windows.mean(axis=0)
+    shares: list[float] = mean.tolist()
+    return shares
 
 
-def _mean_and_error(values: Sequence[float], usual: float = 0.0) -> tuple[float, float]:
-    """Return the mean, and its error had one value more deviated as is usual."""
-    count, (mean, squares, products) = len(values), moments(values)
+def _error(count: int, mean: float, squares: float, products: float, usual: float = 0.0) -> float:
+    """Return the error of a mean as if one more value deviated by `usual` (see `SeriesSums`)."""
     if count < 2:
-        return mean, abs(mean)
-    # Of few values the deviation is itself hardly known: about Student's t over 2.
+        return abs(mean)
+    # A deviation from few values is itself uncertain: about Student's t over 2.
     few = (count + 1) / (count - 1)
     variance = max(squares / (count - 1), (squares + usual * usual) / count)
     factor = _correlation_factor(count, squares, products)
-    return mean, few * math.sqrt(variance / count * factor)
+    return few * math.sqrt(variance / count * factor)
 
 
 def _correlation_factor(count: int, squares: float, products: float) -> float:
-    """Return by how much the variance of a mean is larger, since steps of a queue are alike.
+    """Return the factor by which correlated steps of a queue increase the variance of a mean.
 
-    It is (1 + r) / (1 - r) of an AR(1) process, r being the correlation of successive steps, of
-    which few show 1 / n too little.
+    It is (1 + r) / (1 - r) for an AR(1) process, where r is the correlation of successive steps.
+    An estimate from n steps is 1 / n too low.
     """
     if not squares:
         return 1.0
@@ -543,7 +498,7 @@ def _most_threads(node: Node) -> int:
 
 
 def _stretched(problem: Problem, site: Site) -> float:
-    """How many times as long as its threads alone a job takes that has more of them than cores."""
+    """Return the threads per core of a job that has more threads than cores; else 1."""
     execution = problem.pipeline.tasks[site.task].on[site.node]
     if execution.accelerator is not None:
         return 1.0
@@ -559,7 +514,7 @@ def _with_short_windows(problem: Problem) -> Problem:
 
 
 def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:
-    """Return draws of the undisturbed cell with what a present has in the place of some of them."""
+    """Return the realisation of the undisturbed cell, changed to the measured conditions."""
     if present == Present():
         return real
     exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
@@ -574,7 +529,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             known, times = real.hops, delay_ns
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
         if part in known:
-            fill([times[known.index(part)]], values, stretched, 0, 0)
+            fill([TimesRow.of(times[known.index(part)])], values, stretched, 0, 0)
     for name, mbps in present.rates_mbps.items():
         rates[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():
@@ -601,7 +556,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
 def declared_of(
     problem: Problem, seed: int = SEED, shadow_fraction: ShadowFraction = 0.0
 ) -> Declared:
-    """Return the undisturbed cell; what was asked before is not played again."""
+    """Return the undisturbed cell; results of earlier calls are kept."""
     question = Question.of(problem, "baseline", seed, DRAWN, shadow_fraction)
     known = _known.pop(question, None)
     if known is None:
@@ -617,7 +572,7 @@ def declared_of(
 
 
 _known: dict[Question, Declared] = {}
-#: How many undisturbed cells are remembered.
+#: Number of undisturbed cells that are kept.
 REMEMBERED = 64
 
 
@@ -634,12 +589,9 @@ def _played_as_declared(problem: Problem, seed: int) -> Declared:
 
 
 def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Reference]:
-    """Return the demands of every part, from windows in which slow processes show all they do.
+    """Return the demands of every part.
 
-    Parameters
-    ----------
-    windows : int
-        The fewest windows.
+    They come from at least `windows` windows, and from enough to show all of the slow processes.
     """
     least = slow_processes(problem, "baseline").least_cycles(problem.pipeline.period_ms)
     most = max(most_windows(problem), windows)
@@ -674,7 +626,7 @@ def _played(first: Arrays, index: int) -> Arrays:
 
 
 def _with_shadows(problem: Problem, plain: Declared, question: Question) -> Declared:
-    """Play again with shadow jobs the candidates that are hindered by them."""
+    """Simulate again, with shadow jobs, the candidates that these can delay."""
     shadows = SentShadows(problem, plain.realisation, question.shadow_fractions)
     first = lay_out([(problem, plain.realisation)], shadows=[shadows.realisation])
     l95_ms, violation_rate = dict(plain.l95_ms), dict(plain.violation_rate)
@@ -693,13 +645,13 @@ def _with_shadows(problem: Problem, plain: Declared, question: Question) -> Decl
 
 
 def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
-    """L95 and V_D of every window that has been played."""
+    """Return L95, milliseconds, and V_D of every simulated window."""
     seen = arrays.tables.seen[0]
     return seen["l95_ms"].copy(), seen["missed"] / problem.window_cycles
 
 
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidence:
-    """What all cycles show that have run under a candidate."""
-    flows = flow_rows(problem.pipeline)
-    rows = logged_window(CellArrays(arrays), 0, real.cycles, flows)
-    return Evidence.of(rows, int(real.release_ns[-1]), real.release_ns[:-1])
+    """Return the evidence of all cycles of a simulated candidate."""
+    logged = LoggedCycles(CellArrays(arrays), flow_rows(problem.pipeline))
+    rows = logged.window(0, real.cycles)
+    return Evidence(int(real.release_ns[-1]), real.release_ns[:-1], rows)

@@ -1,12 +1,12 @@
-"""Prices: what windows of a candidate come to where the cell stays on it.
+"""Prices of candidates: mean QoS over the windows of a cell that stays on one candidate.
 
-The kernel plays every candidate alone, as `simulate` does with a policy that never moves: with
-queues, links and cycles that overlap. All candidates meet the same draws, so that they
-differ by where their tasks run and not by luck. More is simulated until the means are known well
-enough (`L95_SHARE`, `RATE`) and every slow process has shown all that it does
-(`dwell.estimators.slow_processes`), or until `MOST_CYCLES` or `MOST_EVENTS` are reached. How much
-that is depends on counts and values alone, so that a price is a fixed number. Traces wrap. Shadow
-jobs are simulated where they matter (`dwell.estimators.sent_shadows`).
+The kernel simulates every candidate alone, as `simulate` does with a policy that never moves: with
+queues, links and overlapping cycles. All candidates have the same realisation, so only the places
+of their tasks differ. The simulation grows until the means are precise enough (`L95_SHARE`,
+`RATE`) and every slow process has had its full effect (`dwell.estimators.slow_processes`), or
+until `MOST_CYCLES` or `MOST_EVENTS` are reached. Its length depends on counts and values alone, so
+a price is a fixed number. Traces wrap. Shadow jobs are simulated if they can delay a candidate's
+own jobs (`dwell.estimators.sent_shadows`).
 """
 
 from __future__ import annotations
@@ -39,89 +39,78 @@ from dwell.model.scenario import Scenario
 from dwell.model.shadow_plan import ShadowFraction, by_candidate
 
 SEED = 20_250_601
-#: Standard errors that are good enough: of L95 as a share of it, and of V_D.
+#: Standard errors to reach: of L95 as a share of it, and of V_D.
 L95_SHARE, RATE = 0.01, 0.0025
 #: Deviations from the mean within which a window agrees with the price.
 AGREES = 4.0
-#: One in so many pairs of windows in succession may be further off, both of them.
+#: In one of this many pairs of successive windows, both may deviate more than `AGREES` allows.
 RARE = 300
-#: How much of a candidate is played at most.
+#: Longest simulation of a candidate.
 MOST_CYCLES, MOST_EVENTS = 100_000, 10_000_000
-#: Windows that are played first: those in which queues settle, which do not count, and others; of a
-#: scenario as many as a run has if nothing else is asked for.
+#: Windows at the start in which queues settle, which do not count; counted windows of the first
+#: simulation; fewest windows with a scenario, the default length of a run.
 SETTLING, FIRST, DISTURBED = 5, 20, 300
 #: Errors by which the means of the two halves of the windows may differ.
 UNSETTLED = 3.0
-#: How much more is played than seems to be needed, since the error is itself an estimate.
+#: Factor on the windows that seem necessary, since the error is itself an estimate.
 AMPLE = 1.2
-#: Of how many questions the answers are kept.
+#: Number of questions whose prices are kept.
 KEPT = 512
-#: Longer windows are played as windows of so many cycles.
+#: Longest simulated window, cycles.
 LONGEST_WINDOW = 4_000
 
 
 @dataclass(frozen=True, slots=True)
 class Price:
-    """Means over the windows of a candidate that stays, with their standard errors.
+    """Means over the windows of a cell that stays on one candidate, with standard errors.
 
-    Parameters
-    ----------
-    l95_ms, l95_error_ms : float
-        L95 as a controller sees it, never more than ``problem.censor_ms``.
-    uncut_l95_ms : float
-        The same without that bound, by what the cycles of a window took in the end; infinite where
-        more than 5 % of them are lost, or never come to an end.
-    violation_rate, violation_error : float
-        V_D.
-    latency_ms : float
-        Mean latency of the cycles that came to an end; NaN where none did.
-    own : mapping of str to float
-        Share of each resource that the cell's jobs take: a node, or a kind of accelerator.
-    foreign, foreign_deviation : mapping of str to float
-        Share of each resource that neither those nor shadow jobs take, with the standard deviation
-        from decision to decision.
-    cycles : int
-        How many cycles were played, those at the begin that do not count included.
-    lost_windows : float
-        Share of the windows that lose more than 5 % of their cycles.
-    is_settled : bool
-        Whether the halves of the windows have the same means, to three of their errors.
-    l95_deviation_ms, violation_deviation : float
-        Deviation of one window from the means: by how much windows differ, by the errors of the
-        means, which know of slow processes, and so large that both of two windows in succession
-        are beyond `AGREES` deviations in one of `RARE` cases at most.
+    The deviation of one window (`l95_deviation_ms`, `violation_deviation`) is the largest of three:
+    the standard deviation of the windows; the error of the mean, which includes slow processes,
+    scaled to one window; the deviation with which at most one in `RARE` pairs of successive windows
+    is beyond `AGREES` deviations.
     """
 
+    #: L95 as a controller measures it, at most ``problem.censor_ms``.
     l95_ms: float
     l95_error_ms: float
+    #: L95 by the final latencies, without that bound; infinite if more than 5 % of the cycles are
+    #: lost or never complete.
     uncut_l95_ms: float
+    #: V_D.
     violation_rate: float
     violation_error: float
+    #: Mean latency of the completed cycles; NaN without any.
     latency_ms: float
+    #: Share of each resource, a node or a kind of accelerator, that the cell's own jobs use.
     own: Mapping[str, float]
+    #: Share of each resource that neither own nor shadow jobs use.
     foreign: Mapping[str, float]
+    #: Standard deviation of `foreign` between decisions.
     foreign_deviation: Mapping[str, float]
+    #: Simulated cycles, including the first windows, which do not count.
     cycles: int
+    #: Share of the windows that lose more than 5 % of their cycles.
     lost_windows: float
+    #: Whether the two halves of the windows have the same means, within `UNSETTLED` errors.
     is_settled: bool
     l95_deviation_ms: float
     violation_deviation: float
 
     @property
     def qos(self) -> QoS:
-        """The same as a QoS, with what others take as declared."""
+        """The price as a QoS, with the declared foreign load."""
         used = {name: min(share + self.foreign[name], 1.0) for name, share in self.own.items()}
         error = self.l95_error_ms, self.violation_error
         return QoS(self.l95_ms, self.violation_rate, used, self.uncut_l95_ms, error)
 
     @property
     def is_good_enough(self) -> bool:
-        """Whether no more has to be played."""
+        """Whether the simulation is long enough."""
         return self.wanted <= 1.0
 
     @property
     def wanted(self) -> float:
-        """How many times as much must be played."""
+        """Factor by which the simulation must grow."""
         l95 = self.l95_error_ms / (L95_SHARE * self.l95_ms) if self.l95_error_ms else 0.0
         errors = max(l95, self.violation_error / RATE)
         return errors * errors
@@ -129,7 +118,7 @@ class Price:
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """All of a problem that its prices depend on."""
+    """The properties of a problem that determine its prices."""
 
     pipeline: Pipeline
     fabric: Fabric
@@ -154,9 +143,9 @@ class Question:
         cycles: int | None,
         shadow_fraction: ShadowFraction = 0.0,
     ) -> Question:
-        """Ask for the prices of a problem (see `prices_of`), whose phase is nothing to it alone."""
+        """Return the key of a problem's prices (see `prices_of`); its phase does not matter."""
         fractions = by_candidate(shadow_fraction, problem.candidates)
-        # Who is not hindered costs the same with shadows and without.
+        # Shadow jobs change the price only of a candidate that they can delay.
         sent = {name: fractions[name] if name in hindered(problem) else 0.0 for name in fractions}
         if problem.pipeline.phase_ms is not None:
             problem = problem.at_phase(None)
@@ -188,24 +177,11 @@ def prices_of(
     cycles: int | None = None,
     shadow_fraction: ShadowFraction = 0.0,
 ) -> Mapping[str, Price]:
-    """Return the price of every candidate; what was asked before is not played again.
+    """Return the price of every candidate; known prices are not simulated again.
 
-    Parameters
-    ----------
-    scenario : str
-        Whose disturbances the cell meets.
-    seed : int
-        Seed of the draws.
-    cycles : int, optional
-        How many cycles of each candidate count; as many as are needed where None.
-    shadow_fraction : float, or mapping of str to float
-        Share of the cycles that are also sent through each alternative, by the candidate that is
-        priced.
-
-    Raises
-    ------
-    KernelError
-        If the compiled kernel cannot be loaded.
+    `cycles` is the number of cycles of each candidate that count [default: as many as necessary].
+    `shadow_fraction` is the share of the cycles that are also sent through each alternative, or
+    this share by candidate. Raise `KernelError` if the compiled kernel cannot be loaded.
     """
     question = Question.of(problem, scenario, seed, cycles, shadow_fraction)
     known = _known.get(question)
@@ -216,12 +192,12 @@ def prices_of(
 
 
 def known_prices() -> dict[Question, Mapping[str, Price]]:
-    """Return what this process has been asked of late, for another one to `take_over`."""
+    """Return the known prices of this process, which another process can `take_over`."""
     return dict(_known)
 
 
 def take_over(known: Mapping[Question, Mapping[str, Price]]) -> None:
-    """Know prices that have been played already; those that were known longest are forgotten."""
+    """Add known prices; drop the oldest beyond `KEPT`."""
     _known.update(known)
     for question in list(_known)[:-KEPT]:
         del _known[question]
@@ -271,7 +247,7 @@ def _answer(question: Question) -> Mapping[str, Price]:
 
 
 def _first_windows(problem: Problem, scenario: Scenario) -> int:
-    """How many windows are played first: those in which a scenario shows all that it does."""
+    """Return the number of windows to simulate first, enough for all disturbances."""
     if not scenario:
         return SETTLING + FIRST
     window_s = problem.window_ms / 1e3
@@ -283,9 +259,10 @@ def _first_windows(problem: Problem, scenario: Scenario) -> int:
 
 
 def most_windows(problem: Problem, cycles: int | None = None) -> int:
-    """How many windows are played of a candidate: so that `cycles` count, or at most; one or more.
+    """Return the largest number of windows of a candidate, at least 1.
 
-    An event is a release, a completion or a message.
+    If `cycles` is given, at least that many cycles count, up to the longest possible run; otherwise
+    `MOST_CYCLES` and `MOST_EVENTS` (releases, completions and messages) are the limits.
     """
     pipeline, width = problem.pipeline, problem.window_cycles
     events = 1 + len(pipeline.tasks) + len(pipeline.flows)
@@ -303,19 +280,16 @@ def price_of(
     *,
     is_last: bool = True,
 ) -> Price:
-    """Price a candidate by its windows on one realisation.
+    """Price a candidate by its windows in one realisation.
 
-    Parameters
-    ----------
-    is_last : bool
-        Whether no more may be simulated, and errors have to take account of slow processes.
+    If `is_last`, the simulation cannot grow any more, and errors include slow processes.
     """
     sent = shadows.realisation if shadows else None
     arrays = lay_out([(problem, realisation)], shadows=[sent], decides=True)
     index = list(problem.candidates).index(name)
     arrays.replace(stamps=stamps_of(arrays, index, shadows))
     play(arrays)
-    tables = arrays.tables  # those that had to grow are others
+    tables = arrays.tables  # read after `play`: a table that grows is replaced
     first = min(SETTLING, realisation.windows - 1)
     seen = tables.seen[0, first:]
     slow = slow_processes(problem, realisation.scenario)
@@ -323,7 +297,7 @@ def price_of(
     l95_ms, violation_rate = float(windows_ms.mean()), float(rates.mean())
     (_, l95_error_ms), (_, violation_error) = mean_and_error(windows_ms), mean_and_error(rates)
     if l95_error_ms and not violation_error:
-        # It is random, and still every window misses as many: none, or all, as a rule.
+        # Windows are random, but all miss the same number of deadlines: usually none, or all.
         violation_error = unseen_error(violation_rate, len(seen) * problem.window_cycles)
     if is_last:
         l95_error_ms, violation_error = slow.errors(
@@ -334,7 +308,7 @@ def price_of(
     done = outcome == CycleOutcome.DONE
     finished_ms = latency_ns[done] / 1e6
     usual_ms = float(np.median(finished_ms)) if len(finished_ms) else 0.0
-    # What is still under way, and no older than usual, may come to an end or not.
+    # A cycle that is unfinished and no older than usual may complete or not: it is left out.
     age_ms = (realisation.release_ns[-1] - realisation.release_ns[since:-1]) / 1e6
     is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
     lost = int(np.count_nonzero(~done & ~is_young))
@@ -377,38 +351,34 @@ def _deviation(windows: Floats, error: float) -> float:
 
 
 def _is_settled(by_window: Floats, error: float) -> bool:
-    """Whether the halves of the windows have the same mean."""
+    """Whether the two halves of the windows have the same mean."""
     half = len(by_window) // 2
     if half < 2:
         return True
     (first, error_1), (last, error_2) = map(mean_and_error, (by_window[:half], by_window[half:]))
-    # Of half as many windows the error is larger by a factor of sqrt(2) at least.
+    # With half the windows, the error is at least sqrt(2) times as large.
     least = math.sqrt(2) * error
     off = abs(first - last) - UNSETTLED * math.hypot(max(error_1, least), max(error_2, least))
-    return off <= 1e-9  # more than sums are rounded by
+    return off <= 1e-9  # a larger difference is more than rounding of sums
 
 
 def _foreign(shares: Floats) -> Floats:
-    """Share of each resource that neither own nor shadow jobs take, shape (rows, resources)."""
+    """Return the share of each resource without own and shadow jobs, shape (rows, resources)."""
     busy, own, shadow, _ = np.moveaxis(shares, 1, 0)
     foreign: Floats = np.maximum(busy - own - shadow, 0.0)
     return foreign
 
 
 def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
-    # Shares that are equal but for the rounding of sums are equal.
+    # Without the rounding of sums, equal shares compare equal.
     return FrozenDict(zip(problem.fabric.resources, shares.round(12).tolist(), strict=True))
 
 
 def _known_later(latency_ns: Ints, seen_ms: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Return L95 of every window by the final latencies, milliseconds, and whether it is lost.
 
-    L95 of a lost window is the value at its close.
-
-    Parameters
-    ----------
-    latency_ns : int64 array, shape (windows, W)
-        `NEVER_NS` where a cycle did not come to an end.
+    L95 of a lost window is its value at the end of the window. `latency_ns` has shape (windows, W),
+    with `NEVER_NS` for cycles that did not complete.
     """
     l95_ns = order_statistic(latency_ns, 95)
     is_lost = l95_ns >= NEVER_NS

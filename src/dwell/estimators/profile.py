@@ -8,8 +8,8 @@ assumes the same foreign load under every candidate. Estimated latencies ignore 
 looks busy here, not slow.
 
 The foreign load of a saturated node is unknown if others use a part of it: they may need more than
-they got, and may take all of the node once the cell leaves. Such a node is expected to be full
-under every candidate, with one exception: a candidate that was active in the last unsaturated
+they got, and may take all of the node once the cell leaves. The estimator expects this node to be
+full under every candidate, with one exception: a candidate that was active in the last unsaturated
 window, and not since, keeps the utilisation measured then, because the cell itself filled the node
 afterwards. Each kind of accelerator is treated like a node; if a window does not measure it, the
 estimates omit it.
@@ -64,11 +64,11 @@ class Profile(CellEstimator):
     l95_ms : mapping of str to float
         Estimated L95 of every candidate, milliseconds; never more than ``problem.censor_ms``.
     uncut_l95_ms : mapping of str to float
-        The same without that bound; infinite where more than 5 % of the cycles are lost.
+        L95 without this bound; infinite if more than 5 % of the cycles are lost.
     violation_rate : mapping of str to float
         Estimated V_D of every candidate.
     own : mapping of str to mapping of str to float
-        Share of each resource that the cell's own work takes, by candidate and resource: a node, or
+        Share of each resource that the cell's own work uses, by candidate and resource: a node, or
         a kind of its accelerators, as ``E.gpu``.
     prices : mapping of str to Price
         The values above with standard errors and the number of simulated cycles.
@@ -195,7 +195,7 @@ def _each(prices: Mapping[str, Price], what: str) -> Mapping[str, Any]:
 
 
 def mean_ms(pipeline: Pipeline, task: Task, execution: Execution) -> float:
-    """Mean execution time of a task, scale included, without sampling error, milliseconds."""
+    """Return the expected execution time of a task, including its scale, milliseconds."""
     process = execution.exec_ms
     if task.scale is None:
         return process.expectation

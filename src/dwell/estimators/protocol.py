@@ -23,7 +23,7 @@ class Support(NamedTuple):
     samples : float
         Number of samples, or their weight.
     age_windows : float
-        Windows since the newest.
+        Windows since the newest sample.
     """
 
     samples: float
@@ -51,7 +51,7 @@ class Estimator(Protocol):
             The candidate that was active. Policies receive its estimate if the estimator is a
             `Learner`, otherwise `observed`.
         own : mapping of str to float
-            Share of each node's cores that the cell's own work took in the window; the rest of
+            Share of each node's cores that the cell's own work used in the window; the rest of
             the observed utilisation is foreign load.
 
         Returns
@@ -126,7 +126,7 @@ class CellEstimator(ABC):
 
     @property
     def present(self) -> Present | None:
-        """The measured changes of declared conditions; None if the estimator measures none."""
+        """Measured changes of the declared conditions, if the estimator measures any."""
         return None
 
     @abstractmethod

@@ -49,7 +49,7 @@ class EstimatorEntry:
     shadows: bool = False
 
 
-#: The estimators of ours by name, in the order in which messages list them.
+#: Built-in estimators by name, in the order of messages.
 REGISTRY: Mapping[str, EstimatorEntry] = MappingProxyType(
     {
         "profile": EstimatorEntry(
@@ -87,12 +87,12 @@ REGISTRY: Mapping[str, EstimatorEntry] = MappingProxyType(
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of all estimators: ours, then those of installed packages by name."""
+    """Return the names of all estimators: built-in, then from installed packages, sorted."""
     return names_with(REGISTRY, GROUP)
 
 
 def shadowing() -> frozenset[str]:
-    """Return the names of the estimators of ours that send shadow jobs."""
+    """Return the names of the built-in estimators that send shadow jobs."""
     return frozenset(name for name, entry in REGISTRY.items() if entry.shadows)
 
 

@@ -1,6 +1,6 @@
 """Scaling: estimates of all candidates from measurements of the active placement.
 
-There are no shadow jobs. If a task takes longer than declared on its node, Scaling assumes the same
+Scaling sends no shadow jobs. If a task takes longer than declared on its node, it assumes the same
 factor on every other node. A *ratio* is the compute time of a task on another node over its time on
 this node, in every cycle. A *bound* is the largest delay of an unused link. They replace declared
 values when candidates are simulated (see `dwell.estimators.online`).
@@ -94,8 +94,8 @@ class Scaling(Learning):
         #: Times of jobs (each alone) and of messages in the last window, milliseconds, by cycle.
         self._jobs, self._messages = np.empty((0, 0)), np.empty((0, 0))
 
-    def _take_in(self, demands: Mapping[Part, Floats], evidence: Evidence) -> None:
-        super()._take_in(demands, evidence)
+    def _take_in(self, evidence: Evidence) -> None:
+        super()._take_in(evidence)
         newest = int(evidence.placement[-1])
         active = tuple(self.problem.candidates.values())[newest]
         self._has_changed |= active != self._active
@@ -199,7 +199,7 @@ class Scaling(Learning):
     def _executed(
         self, column: int, task: str, active: Placement, placement: Placement
     ) -> Floats | None:
-        """Return a bound on the time of a task's job in each cycle; None without a ratio."""
+        """Return a bound on the time of a task's job in each cycle; None if unknown."""
         here, there, alone_ms = active[task], placement[task], self._jobs[:, column]
         if here == there:
             return alone_ms

@@ -1,4 +1,4 @@
-"""Sent shadows: the shadow jobs of a realisation whose cycles all run under one candidate.
+"""Shadow jobs in a realisation whose cycles all run under one candidate.
 
 Shadow jobs use the capacity that own jobs leave, and most candidates have the same price with and
 without them. A candidate is simulated with shadows if they may delay its own jobs: on links, on
@@ -28,15 +28,8 @@ NEGLIGIBLE = 0.002
 class SentShadows:
     """Shadow jobs of an estimator in a realisation.
 
-    Parameters
-    ----------
-    fraction : float, or mapping of str to float
-        Share of cycles sent through each alternative, by active candidate.
-
-    Attributes
-    ----------
-    realisation : Realisation
-        Sampled conditions of the shadow jobs.
+    `fraction` is the share of cycles sent through each alternative, by active candidate. The
+    attribute `realisation` has the sampled conditions of the shadow jobs.
     """
 
     def __init__(
@@ -99,7 +92,7 @@ def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
 
 
 def _scarce(problem: Problem, placement: Placement, tasks: Iterable[str]) -> set[str]:
-    """Accelerators, and CPUs under a quota, that tasks run on."""
+    """Return the accelerators, and the CPUs with a quota, that tasks use."""
     found = set()
     for name in tasks:
         node = problem.fabric.nodes[placement[name]]

@@ -1,8 +1,8 @@
-"""Shadow price: what sending shadows costs a candidate's own cycles, and which share that allows.
+"""Cost of shadow jobs to a candidate's own cycles, and the largest affordable share of cycles.
 
-Where `shadow_fraction` is `auto`, every candidate gets the largest share of `SHARES` whose price
-stays below `LEAST`, or below a part of Delta_min where that is more: shadows must not make a
-placement look worse by what decides a move. The utilisation that shadows add is not in the price.
+If `shadow_fraction` is `auto`, every candidate gets the largest share with a cost below `LEAST` or
+below `PART` of Delta_min, the larger of the two: shadows must not make a placement look worse by
+enough to decide a move. The cost excludes the utilisation of the shadow jobs.
 """
 
 from __future__ import annotations
@@ -17,41 +17,32 @@ from dwell.model.frozen import FrozenDict
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowFraction
 
-#: Shares below the largest one, which is `Problem.shadow_fraction`; then none.
+#: Shares to try after `Problem.shadow_fraction`, the largest; if none is affordable, 0.
 SHARES = 0.02, 0.01, 0.005
-#: Part of Delta_min that shadows may cost, and the J that they always may.
+#: Part of Delta_min that shadows may cost; cost in J that is always allowed.
 PART, LEAST = 0.2, 0.001
-#: Cycles that a candidate is played for, with shadows and without.
+#: Simulated cycles of a candidate, with shadows and without.
 CYCLES = 20_000
 
 
 @dataclass(frozen=True, slots=True)
 class ShadowPrice:
-    """Price of sending shadows while a candidate is active.
+    """Price of sending shadows while a candidate is active."""
 
-    Parameters
-    ----------
-    fraction : float
-        Share of the cycles that each alternative gets.
-    l95_ms, violation_rate : float
-        L95 and V_D with shadows, less those without.
-    cost : float
-        Their part of J.
-    """
-
+    #: Share of the cycles that each alternative gets.
     fraction: float
+    #: L95 with shadows minus L95 without.
     l95_ms: float
+    #: V_D with shadows minus V_D without.
     violation_rate: float
+    #: Effect of both differences on J.
     cost: float
 
 
 def fraction_of(problem: Problem) -> ShadowFraction:
     """Return the share of the cycles that each alternative gets by ``problem.controller``.
 
-    Returns
-    -------
-    float, or mapping of str to float
-        By the active candidate where the share is `auto`.
+    If the setting is `auto`, the result is the share by active candidate.
     """
     if problem.controller.shadow_fraction != AUTO:
         return problem.shadow_fraction
@@ -60,7 +51,7 @@ def fraction_of(problem: Problem) -> ShadowFraction:
 
 
 def affordable(problem: Problem, prices: Sequence[ShadowPrice]) -> float:
-    """Return the largest share that costs little enough; 0 where none does."""
+    """Return the largest affordable share; 0 if all shares cost too much."""
     most = max(PART * problem.controller.min_improvement, LEAST)
     return next((one.fraction for one in prices if one.cost < most), 0.0)
 
@@ -68,7 +59,7 @@ def affordable(problem: Problem, prices: Sequence[ShadowPrice]) -> float:
 def shadow_prices(problem: Problem) -> Mapping[str, Sequence[ShadowPrice]]:
     """Return, by candidate, the price of each share from the largest to the first affordable one.
 
-    With shadows and without, a candidate meets the same cycles. What has been played is kept (see
+    The realisation is the same with and without shadows. Results of simulations are kept (see
     `dwell.estimators.prices`).
     """
     most = problem.shadow_fraction
@@ -89,7 +80,7 @@ def shadow_prices(problem: Problem) -> Mapping[str, Sequence[ShadowPrice]]:
 
 
 def _difference(problem: Problem, fraction: float, paid: Price, free: Price) -> ShadowPrice:
-    """Return the price of a share: with shadows less without."""
+    """Return the price of a share: the difference between prices with and without shadows."""
     weights, targets = problem.objective.weights, problem.objective.targets
     l95_ms = paid.l95_ms - free.l95_ms
     violation_rate = paid.violation_rate - free.violation_rate

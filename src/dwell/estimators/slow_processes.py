@@ -1,9 +1,9 @@
-"""Slow processes: what is random in a cell and stays as it is for many windows.
+"""Slow processes: random processes of a cell that keep their state for many windows.
 
-The windows of a candidate tell its mean only after every slow process has shown all that it does:
-an on/off process (bursts, episodes) after `RENEWALS` times off and on, an AR(1) process after
-`RENEWALS` correlation times, a trace after one loop. A price that is made from less states an error
-from the number of times that each process was seen, since single cycles are then not independent.
+The mean over a candidate's windows is reliable after every slow process has had its full effect: an
+on/off process (bursts, episodes) after `RENEWALS` times off and on, an AR(1) process after
+`RENEWALS` correlation times, a trace after one loop. The error of a shorter simulation depends on
+how often each process occurred, since single cycles are then correlated.
 """
 
 from __future__ import annotations
@@ -26,36 +26,29 @@ from dwell.model.problem import Problem
 from dwell.model.process import AR1, Constant, Process, Trace
 from dwell.model.scenario import LinkDisturbance, Scenario, acts
 
-#: Times off and on, or correlation times, after which a mean is known.
+#: Number of times off and on, or of correlation times, after which a mean is reliable.
 RENEWALS = 30
-#: Renewals or correlation times below which windows alone do not tell the error.
+#: With fewer renewals or correlation times, the windows alone underestimate the error.
 FEW = 300
-#: Share of the time below which an on/off process does not matter.
+#: An on/off process with a share of the time on up to this is ignored.
 RARE = 0.0025
-#: Parts of a run whose means have the error of the mean.
+#: Number of parts of a run; the deviation of their means gives the error of the mean.
 STRETCHES = 20
 
 
 class OnOff(NamedTuple):
-    """An on/off process: bursts of a node or a link, or the episodes of a scenario.
+    """An on/off process: bursts of a node or a link, or the episodes of a scenario."""
 
-    Parameters
-    ----------
-    stream : str
-        Name of its random streams.
-    places : frozenset of str
-        Nodes and links that it acts on.
-    every, length : Process
-        Times off and on, in units of `unit_ns`.
-    begin_ns : int
-        Begin of the first time off.
-    """
-
+    #: Name of its random streams.
     stream: str
+    #: Nodes and links that it affects.
     places: frozenset[str]
+    #: Times off, in units of `unit_ns`.
     every: Process
+    #: Times on, in units of `unit_ns`.
     length: Process
     unit_ns: float
+    #: Start of the first time off.
     begin_ns: int = 0
 
     @property
@@ -65,16 +58,13 @@ class OnOff(NamedTuple):
 
     @property
     def renewal_ms(self) -> float:
-        """Mean time off and on."""
+        """Mean time off plus mean time on."""
         return self.every.expectation * self.unit_ns / NS_PER_MS + self.on_ms
 
     def seen(self, realisation: Realisation, edges_ns: NDArray[np.int64]) -> tuple[int, Floats]:
-        """Return how often it is on in a realisation, and its share of each window.
+        """Return how often it is on in some windows, and its share of each window.
 
-        Parameters
-        ----------
-        edges_ns : int64 array, shape (windows + 1,)
-            Begins of the windows, and the end of the last.
+        `edges_ns` has the starts of the windows and the end of the last window.
         """
         name = f"{realisation.streams}{self.stream}"
         horizon_ns, seed = int(edges_ns[-1]), realisation.seed or 0
@@ -92,45 +82,30 @@ class OnOff(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """An AR(1) process.
+    """An AR(1) process."""
 
-    Parameters
-    ----------
-    places : frozenset of str
-        Nodes and links that have it.
-    cycles : float
-        Correlation time: cycles that tell as much of the mean as one independent value.
-    """
-
+    #: Nodes and links that it affects.
     places: frozenset[str]
+    #: Correlation time: cycles with as much information on the mean as one independent value.
     cycles: float
 
 
 @dataclass(frozen=True, slots=True)
 class SlowProcesses:
-    """The slow processes of a cell under a scenario.
+    """The slow processes of a cell under a scenario."""
 
-    Parameters
-    ----------
-    on_off : tuple of OnOff
-        Those with a share of the time above `RARE`.
-    memories : tuple of Memory
-    loops : tuple of float
-        Cycles after which each replayed trace is back at its start.
-    has_one_loop : bool
-        Whether a single trace is all that is random.
-    is_timed : bool
-        Whether disturbances begin or end at set times, for which a run has no stationary mean.
-    """
-
+    #: On/off processes with a share of the time above `RARE`.
     on_off: tuple[OnOff, ...]
     memories: tuple[Memory, ...]
+    #: Length of each replayed trace, cycles.
     loops: tuple[float, ...]
+    #: Whether the only random input is one trace.
     has_one_loop: bool
+    #: Whether disturbances begin or end at set times: a run then has no stationary mean.
     is_timed: bool
 
     def least_cycles(self, period_ms: float) -> float:
-        """Return the number of cycles after which each of them has shown all that it does."""
+        """Return the number of cycles in which every slow process has its full effect."""
         renewals = [RENEWALS * one.renewal_ms / period_ms for one in self.on_off]
         return max((*renewals, *(RENEWALS * one.cycles for one in self.memories), *self.loops, 0.0))
 
@@ -143,19 +118,15 @@ class SlowProcesses:
         rates: Floats,
         errors: tuple[float, float],
     ) -> tuple[float, float]:
-        """Return the standard errors of a candidate's L95 (ms) and V_D by all that was seen.
+        """Return the standard errors of a candidate's L95 (ms) and V_D, including slow processes.
 
-        Parameters
-        ----------
-        l95_ms, rates : float64 array, shape (windows,)
-            L95 and V_D of the last windows of the realisation.
-        errors : pair of float
-            Their standard errors by the windows alone, which hold if nothing is slow.
+        `l95_ms` and `rates` are L95 and V_D of the last windows of the realisation. `errors` are
+        their standard errors from the windows alone, which are correct without slow processes.
         """
         counted = len(rates) * problem.window_cycles
         if self.has_one_loop and counted >= self.loops[0]:
             rate = float(rates.mean())
-            # Cycles beyond whole loops count some rows once more than others.
+            # Cycles after the last complete loop count some rows once more than others.
             more = math.fmod(counted, self.loops[0]) / counted
             return errors[0], more * math.sqrt(rate * (1 - rate))
         places, columns = _places(problem, name), np.column_stack((l95_ms, rates))
@@ -180,16 +151,11 @@ class SlowProcesses:
     def _by_times(
         self, problem: Problem, realisation: Realisation, places: frozenset[str], columns: Floats
     ) -> tuple[Floats, Floats]:
-        """Return windows without the effect of rare on/off processes, and the squared errors of it.
+        """Return windows without the effect of on/off processes, and the squared errors of it.
 
-        The effect comes from a regression on the share of each window in which a process is on.
-
-        Parameters
-        ----------
-        places : frozenset of str
-            Nodes and links that the candidate uses.
-        columns : float64 array, shape (windows, 2)
-            L95 and V_D.
+        Processes with at least `FEW` renewals are ignored. The effect comes from a regression on
+        the share of each window in which a process is on. `places` are the nodes and links that the
+        candidate uses; `columns` has L95 and V_D of each window, shape (windows, 2).
         """
         width = problem.window_cycles
         edges_ns = realisation.release_ns[-1 - len(columns) * width :: width]
@@ -212,20 +178,11 @@ class SlowProcesses:
         return columns, squares
 
     def whole_loops(self, width: int, most: int) -> int | None:
-        """Return after how many windows a single trace that is all that is random was replayed.
+        """Return the number of windows that replay the only random input, a trace, completely.
 
-        Parameters
-        ----------
-        width : int
-            Cycles of a window.
-        most : int
-            Largest number of windows: if whole loops end with a window beyond it, or never, the
-            last window ends in the second loop.
-
-        Returns
-        -------
-        int or None
-            None if there is no such trace.
+        A window has `width` cycles. If complete loops end with a window within the first `most`
+        windows, the result is the number of this window; otherwise, it is the smallest number of
+        windows with a complete loop. If other inputs are random, or no trace exists, it is None.
         """
         if not self.has_one_loop:
             return None
@@ -242,7 +199,7 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     processes = list(processes_of(problem, items))
     tables = {id(one.table): one.table for _, one in processes if isinstance(one, Trace)}
     loops = tuple(table.loop_cycles(problem.pipeline.period_ms) for table in tables.values())
-    # Where instants of rows are closer than releases, a loop does not replay each of them.
+    # If rows are closer in time than releases, a loop skips some of them.
     replayed = [loop >= table.rows for loop, table in zip(loops, tables.values(), strict=True)]
     random = any(not isinstance(one, Constant | Trace) for _, one in processes)
     lossy = any(link.loss for link in fabric.links.values()) or any(
@@ -287,7 +244,7 @@ def processes_of(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozens
 
 
 def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:
-    """Yield the on/off processes that have an effect, and no end."""
+    """Yield the on/off processes with an effect and without an end."""
     fabric = problem.fabric
     for name, node in fabric.nodes.items():
         if node.bursts is not None and node.bursts.threads:
@@ -315,9 +272,9 @@ def _places(problem: Problem, name: str) -> frozenset[str]:
 
 
 def mean_and_error(by_window: Floats) -> tuple[float, float]:
-    """Mean of windows, and its standard error by the means of stretches of them.
+    """Return the mean of windows, and its standard error from the means of stretches of windows.
 
-    Windows that are all equal have no error; of a single one it is infinite.
+    The error is 0 if all windows are equal, and infinite for a single window.
     """
     mean = float(by_window.mean())
     if len(by_window) < 2:
@@ -330,6 +287,6 @@ def mean_and_error(by_window: Floats) -> tuple[float, float]:
 
 
 def unseen_error(rate: float, values: float) -> float:
-    """Return the standard error of a rate, had one value more been missed and one not (Laplace)."""
+    """Return the standard error of a rate with one more miss and one more hit (Laplace)."""
     rate = (rate * values + 1) / (values + 2)
     return math.sqrt(rate * (1 - rate) / values)

@@ -1,4 +1,4 @@
-"""Durations of jobs and messages in a window, and when unfinished ones count as lost."""
+"""Durations of jobs and messages in a window, and the age at which they count as lost."""
 
 from __future__ import annotations
 
@@ -24,15 +24,8 @@ def patience_ns(problem: Problem) -> int:
 def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:
     """Return the durations between instants, milliseconds.
 
-    A duration is infinite if the job or message is lost, and NaN if it has not begun or is
-    unfinished but not lost.
-
-    Parameters
-    ----------
-    begin_ns, end_ns : int64 array, shape (n, columns)
-        -1 for an instant in the future.
-    limit_ns : int
-        An unfinished job or message that began before this instant counts as lost.
+    An instant in the future is -1. An unfinished job or message that began before `limit_ns` counts
+    as lost: its duration is infinite. Other unknown durations are NaN.
     """
     span: Floats = (end_ns - begin_ns) / NS_PER_MS
     open_ended = np.minimum(begin_ns, end_ns) < 0

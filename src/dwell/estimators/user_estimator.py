@@ -12,13 +12,7 @@ from dwell.model.qos import QoS
 
 
 class UserEstimator(CellEstimator):
-    """A user's object with defaults for its missing methods.
-
-    Parameters
-    ----------
-    given : Estimator
-        An object with `estimate`.
-    """
+    """A user's object, with defaults for its missing methods."""
 
     def __init__(self, given: Estimator) -> None:
         self._given = given
@@ -59,10 +53,7 @@ class UserEstimator(CellEstimator):
 def as_started(given: Estimator, problem: Problem, *, copied: bool) -> CellEstimator:
     """Return a started estimator with the interface of the controller.
 
-    Parameters
-    ----------
-    copied : bool
-        Whether to start a copy: the object may have seen windows since it was made.
+    If `copied`, start a copy, since the object may have learnt from windows since it was made.
     """
     made = copy.deepcopy(given) if copied else given
     own = made if isinstance(made, CellEstimator) else UserEstimator(made)

@@ -1,1 +1,1 @@
-"""What is random in a scenario, drawn and laid out, and the compiled event loop over it."""
+"""Samples of a scenario's random quantities, and the compiled event loop that simulates it."""

@@ -1,4 +1,4 @@
-// What Python calls of the event loop.
+// Functions of the event loop for Python.
 
 #include "advance.h"
 
@@ -20,7 +20,7 @@ Status advance(const Tables& tables) {
 
 using namespace dwell;
 
-// Plays a simulation on; returns a Status.
+// Continues a simulation; returns a Status.
 DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
   const bool is_plain = tables->cells.size == 1 && tables->log.size == 0;
   if (tables->quotas.size > 0) {
@@ -29,15 +29,15 @@ DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
   return is_plain ? advance<false, true>(*tables) : advance<false, false>(*tables);
 }
 
-// Adds an event of the caller's; there must be room.
+// Adds an event of the caller; the queue must have room.
 DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noexcept {
   Queue queue(tables->events, tables->following, tables->days, tables->clock[0]);
   queue.push(at_ns, key);
   queue.save(tables->clock[0]);
 }
 
-// Writes what the logs still have of cycles, and of those of their shadows, as rows of a `Window`;
-// into `beside`, where cells share servers, two integrals for each job (see `Log`).
+// Writes the logs of cycles and of their shadows as rows of a `Window`. If cells share servers,
+// writes two integrals per job into `beside` (see `Log`).
 DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_cells, i64 first,
                                       i64 n, i64 n_tasks, const i64* flows, i64 n_flows, i64* out,
                                       i64* beside) noexcept {
@@ -65,8 +65,9 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
   }
 }
 
-// Sends the state of a task that moves (see send_state); `key` is the event of its arrival, `out`
-// the instant of the next attempt, -1 for none, and its number. There must be room.
+// Attempts to send the state of a task that moves (see send_state). `key` is the event of its
+// arrival; `out` is the instant of the next attempt, -1 for none, and its number. The queue must
+// have room.
 DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 key,
                                    i64 now, i64* out) noexcept {
   Simulation<true, false> simulation(*tables);
@@ -76,7 +77,7 @@ DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64
   out[1] = next.number;
 }
 
-// Lets other messages wait no longer for state that is not sent again.
+// Releases the messages that wait for state that is not sent again.
 DWELL_EXPORT void dwell_end_repeats(const Tables* tables, i64 key, i64 now) noexcept {
   Simulation<true, false> simulation(*tables);
   end_repeats(simulation, key, now);

@@ -1,11 +1,12 @@
-// The event loop: one call plays a simulation to the next decision, or to its end.
+// The event loop: one call simulates up to the next decision, or to the end.
 #pragma once
 
 #include "rules.h"
 
 namespace dwell {
 
-// Whether the next event finds room for all it may add; otherwise what must grow.
+// `kPaused` if there is room for all that the next event may add; else the status for the full
+// table.
 template <class S>
 Status room(const S& s, i64 margin) {
   if (!s.queue.has_room(margin + s.clock[0].n_held)) return kGrowEvents;
@@ -56,12 +57,11 @@ void handle(S& s, i64 key, i64 now) {
     case kClose:
     case kDecide:
     case kGuard:
-      break;  // the loop's own
+      break;  // handled by `play`
   }
 }
 
-// Has the built-in policy decide on what a decision looks at, where there is one; returns whether
-// the call ends here.
+// Lets the built-in policy decide, if any; returns whether the call ends here.
 template <class S>
 [[gnu::noinline]] bool pauses_at(S& s, i64 index) {
   if (s.rule.size == 0) return s.clock[0].pauses != 0;
@@ -70,13 +70,13 @@ template <class S>
   return false;
 }
 
-// Plays events until a decision is due (where `pauses` is set), or room runs out, or the budget, or
-// every window has closed.
+// Handles events until a decision is due (if `pauses` is set), room or the budget runs out, or all
+// windows have ended.
 //
-// Whatever happens often is inlined here (`flatten`): the loop takes a sixth less time.
+// Frequent functions are inlined here (`flatten`), which saves a sixth of the time.
 template <class S>
 [[gnu::flatten]] Status play(S& s) {
-  // How many cells wait for a close, or migrate: without any the run is over.
+  // Number of cells that wait for the end of a window, or migrate; at 0 the run is over.
   i64 waiting = 0;
   for (i64 cell = 0; cell < s.cells.size; ++cell) {
     waiting += announce_close(s, cell);
@@ -95,7 +95,7 @@ template <class S>
     const Kind kind = kind_of(event.key);
     const i64 cell = cell_of(event.key);
     if (kind == kClose) {
-      // A window that the guard has cut short does not close.
+      // The guard has cut this window short; its event is invalid.
       if (cycle_of(event.key) != s.cell(cell).close_cycle) continue;
       const i64 window = s.cell(cell).window;
       close_window(s, cell, now);
@@ -104,7 +104,7 @@ template <class S>
       continue;
     }
     if (kind == kDecide) {
-      // A decision that a move has put off is not due.
+      // A move has postponed this decision; its event is invalid.
       if (cycle_of(event.key) != s.cell(cell).look_cycle) continue;
       const i64 index = s.cell(cell).look;
       look(s, cell, now);

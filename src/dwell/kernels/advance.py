@@ -45,22 +45,30 @@ def post_event(of: CellArrays, at_ns: int, kind: EventKind, cycle: int = 0, item
     _post()(of.whole.address, at_ns, make_key(kind, of.part.row, cycle, item))
 
 
-def logged_window(of: CellArrays, first: int, last: int, flows: Ints) -> WindowRows:
-    """Return the logs of the cycles `first` to `last` - 1 of a cell and of its shadow, if any.
+class LoggedCycles:
+    """The logs of a cell's cycles and of their shadows, if any.
 
-    `flows` contains the flows of the result as indices into the kernel's flows.
+    Parameters
+    ----------
+    flows : int64 array
+        The flows of the result as indices into the kernel's flows.
     """
-    part, tasks, count = of.part, of.part.tasks, len(flows)
-    table = np.empty((last - first, part.rows * (1 + 4 * tasks + count)), np.int64)
-    beside = None
-    if of.whole.tables.clock[0]["has_shared"]:
-        beside = np.empty((last - first, part.rows, tasks, 2), np.int64)
-    rows = WindowRows(table, tasks, count, beside)
-    _logged()(
-        *(of.whole.address, part.row, part.rows, first, last - first, tasks),
-        *(flows.ctypes.data, count, rows.row.rows, rows.beside_address),
-    )
-    return rows
+
+    def __init__(self, of: CellArrays, flows: Ints) -> None:
+        self._of, self._flows, self._flows_at = of, flows, flows.ctypes.data
+        self._has_shared = bool(of.whole.tables.clock[0]["has_shared"])
+
+    def window(self, first: int, last: int) -> WindowRows:
+        """Return the logs of the cycles `first` to `last` - 1."""
+        part, n, count = self._of.part, last - first, len(self._flows)
+        table = np.empty((n, part.rows * (1 + 4 * part.tasks + count)), np.int64)
+        beside = np.empty((n, part.rows, part.tasks, 2), np.int64) if self._has_shared else None
+        rows = WindowRows(table, part.tasks, count, beside)
+        _logged()(
+            *(self._of.whole.address, part.row, part.rows, first, n, part.tasks),
+            *(self._flows_at, count, rows.row.rows, rows.beside_address),
+        )
+        return rows
 
 
 def send_state(

@@ -12,7 +12,15 @@ from numpy.typing import NDArray
 
 from dwell.errors import SimulationError
 from dwell.kernels import codes
-from dwell.kernels.codes import LAST_NS, EventKind, Scheduler, ShadowPart, make_key
+from dwell.kernels.codes import (
+    LAST_NS,
+    EventKind,
+    Scheduler,
+    ShadowPart,
+    cell_of,
+    kind_of,
+    make_key,
+)
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.kernels.rows import Rows, Tables, row_types
 from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota
@@ -21,13 +29,13 @@ from dwell.model.number_arrays import Ints
 from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
-RING_START = 64
-#: A shadow is given up after the release of a window and this many further cycles.
+RING_START = 8
+#: A shadow is given up when a window of cycles and this many more have been released after it.
 GIVEN_UP_AFTER = 64
 #: Number of events after which the kernel returns to Python, about every 20 ms.
 BUDGET = 200_000
-#: Slice that a core takes from the pool of a quota (sched_cfs_bandwidth_slice_us), and least run
-#: time of a turn (sched_base_slice of two CPUs; twice as much for eight and more), ms.
+#: Slice that a core draws from the pool of a quota (sched_cfs_bandwidth_slice_us), and least length
+#: of a turn (sched_base_slice of two CPUs; twice as long for eight and more), ms.
 DRAWN_MS, LEAST_MS = 5.0, 1.4
 #: Number of shares of a resource: busy, own, of shadows, of other cells.
 PARTS = 4
@@ -93,7 +101,7 @@ class Arrays:
         return other
 
     def restart(self, first: Arrays) -> None:
-        """Restore the state of the unused tables of which these are a copy."""
+        """Restore the state of `first`, the unused tables that were copied."""
         if self._state is not None and first._state is not None:
             np.copyto(self._state, first._state)
             return
@@ -108,13 +116,26 @@ class Arrays:
             row = self.tables._fields.index(name)
             self._addresses[row] = table.ctypes.data, table.size
 
+    def leave_out(self, rows: Collection[int]) -> None:
+        """Leave some cells out of the simulation: they release no cycles and have no windows."""
+        cells, clock, events = self.tables.cells, self.tables.clock[0], self.tables.events
+        without = [*rows]
+        cells["close_cycle"][without] = cells["n_cycles"][without] + 1
+        first = events[: clock["n_events"]]
+        kept = [
+            kind_of(key) != EventKind.RELEASE or cell_of(key) not in rows
+            for key in first["key"].tolist()
+        ]
+        clock["n_events"] = sum(kept)
+        events[: clock["n_events"]] = first[kept]
+
     def use_rule(
         self,
         numbers: Mapping[str, float],
         options: Mapping[str, NDArray[np.float64]],
         **tables: NDArray[Any],
     ) -> None:
-        """Let the kernel decide at closes; for a single cell without a shadow.
+        """Let the kernel decide at the end of windows; for a single cell without a shadow.
 
         `numbers` and `options` contain columns of the tables `rule` and `options`. The further
         tables are `work`, `switching` and `tiers`.
@@ -244,12 +265,12 @@ def lay_out(
     log_jobs : bool
         Whether to record the instants of all jobs.
     log_windows : bool
-        Whether to record the instants of the jobs of a window until it closes.
+        Whether to record the instants of the jobs of a window until its end.
     decides : bool
         Whether to fill the `look` tables if decisions are more frequent than windows.
     shadows : sequence of Realisation
-        Samples for the shadow jobs of each cell (see `draw_shadows`); None for a cell without a
-        shadow.
+        Samples for the shadow jobs of each cell (see `draw_shadows`); None if a cell sends no
+        shadows.
     """
     return _Layout(cells, shared, log_jobs, log_windows, decides, shadows).arrays()
 
@@ -469,7 +490,7 @@ class _Layout:
         real: Realisation,
         link_row: Mapping[str, int],
     ) -> None:
-        """Add where tasks of the newest row of cells run, and flows cross, by candidate."""
+        """Add the sites of tasks and the hops of flows of the newest cell row, by candidate."""
         hop_0 = self._add_hops(problem, real, link_row)
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         names = list(problem.pipeline.tasks)
@@ -487,17 +508,17 @@ class _Layout:
             self.back_ns.append(back_ns(problem, placement))
 
     def _add_pairs(self, problem: Problem) -> None:
-        """Add what the tasks are to a shadow, by pair of candidates."""
+        """Add the roles of the tasks for a shadow, by pair of candidates."""
         for active, other in itertools.product(problem.candidates.values(), repeat=2):
             self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
 
     def _add_shadow(
         self, index: int, problem: Problem, real: Realisation, link_row: Mapping[str, int]
     ) -> None:
-        """Add the shadow of a cell: workers and draws of its own, all else shared."""
+        """Add the shadow of a cell: its own workers and samples; it shares all other rows."""
         cells, part = self.rows["cells"], self.parts[index]
         cells[part.row]["shadow"] = len(cells)
-        # Its windows never close.
+        # A shadow has no windows.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
         shadow["decide_cycles"] = 0
         cells.append(cells[part.row] | shadow | {"shadow": -1, "parent": part.row})
@@ -507,7 +528,7 @@ class _Layout:
         self._add_candidates(index, problem, real, link_row)
 
     def _add_below(self, node: int, kind: str | None) -> None:
-        """Add what own jobs leave of a server, unless it is there."""
+        """Add the server below a server, which has the cores that own jobs leave, if missing."""
         row = self.server_row[node, kind]
         above = self.rows["servers"][row]
         if above["below"] >= 0:
@@ -521,7 +542,7 @@ class _Layout:
         self.server_workers.append(0)
 
     def _add_changes(self, index: int, changes: NodeChanges) -> None:
-        """Add the changes of a cell's nodes; those of a shared node are the first cell's."""
+        """Add the changes of a cell's nodes; the first cell's changes apply to shared nodes."""
         row = np.array([self.node_row[index, name] for name in changes.nodes], np.int64)
         table = changes.table
         if not np.array_equal(row, np.arange(len(row))):
@@ -560,7 +581,7 @@ class _Layout:
                     "own": cell * self.max_resources + columns.index(execution.resource(node_name)),
                     "exec_ns": exec_ns,
                     "depth": task.depth,
-                    "rank": -task.priority,  # a smaller one goes first
+                    "rank": -task.priority,  # the smallest goes first
                     "workers": execution.workers,
                     "idle": execution.workers,
                     "threads": threads,
@@ -593,7 +614,7 @@ class _Layout:
         return link_row
 
     def _add_hops(self, problem: Problem, real: Realisation, link_row: Mapping[str, int]) -> int:
-        """Add the hops of a row of cells; return which is the first."""
+        """Add the hops of a row of cells; return the number of the first."""
         hop_0 = len(self.layers)
         payload = {
             (flow.source, flow.target): flow.payload_bytes for flow in problem.pipeline.flows
@@ -631,7 +652,7 @@ class _Layout:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
 
     def _foreign(self, server: Mapping[str, Any], changes: Rows) -> int:
-        """Most foreign threads of a server among those that take turns."""
+        """Largest number of a server's foreign threads that take turns; 0 without turns."""
         if server["scheduler"] != Scheduler.TURNS:
             return 0
         return int(changes["stress"][changes["node"] == server["node"]].max(initial=0))
@@ -674,7 +695,7 @@ class _Layout:
         rows["clock"].append(clock | {"day_bits": day_bits})
         self._announce_first(changes)
         logged = cells * (cycles if self.logs_all else slots if self.logs_windows else 0)
-        # Rows beyond those that are laid out.
+        # Empty rows of each table.
         room = {
             "events": 4 * margin,
             "held": len(rows["events"]) + 4 * margin,
@@ -733,7 +754,7 @@ class _Layout:
         return Tables(**tables)
 
     def _calendar(self) -> tuple[int, int]:
-        """Bits of a day, in which about one event happens, and days of a year: two periods."""
+        """Bits of a day, with about one event, and the number of days of a year, two periods."""
         pipelines = [problem.pipeline for problem, _ in self.cells]
         # Releases, completions, and messages.
         rate_hz = sum(
@@ -744,12 +765,12 @@ class _Layout:
         return day_bits, 1 << (year_ns >> day_bits).bit_length()
 
     def _slots(self) -> int:
-        """Cycles that the ring has room for at first, a power of two: a window's, where logged."""
+        """Initial room of the ring in cycles, a power of two; a window if windows are logged."""
         held = RING_START
         if self.logs_windows and not self.logs_all:
             for problem, real in self.cells:
                 close_ns = window_close_ns(problem, real.release_ns[:-1], real.release_ns[1:])
-                # Cycles that are released between a window's last one and its close.
+                # Cycles that are released between the last cycle of a window and its end.
                 after = 0
                 if (close_ns > real.release_ns[1:]).any():
                     released = np.searchsorted(real.release_ns[:-1], close_ns)
@@ -765,7 +786,7 @@ class _Layout:
         ]
         if len(changes):
             first.append((int(changes[0]["at_ns"]), make_key(EventKind.CHANGE)))
-        # The queue is sorted, the first event last.
+        # The queue is sorted; the first event is last.
         self.rows["events"] = [
             {"at_ns": at_ns, "key": key} for at_ns, key in sorted(first, reverse=True)
         ]
@@ -773,11 +794,10 @@ class _Layout:
 
 
 def back_ns(problem: Problem, placement: Placement) -> int:
-    """Time from a completion until the guard hears of it, nanoseconds.
+    """Time from a completion until the guard learns of it, nanoseconds.
 
-    A completion is a small message that takes whichever way is shortest: the least sum of mean
-    delays from the sink's node to the stamper's, of the sink that is farthest; 0 where no links
-    lead there.
+    A completion is a small message on the shortest path of links. The time is the least sum of mean
+    delays from the node of a sink to the stamper's node, for the farthest sink; 0 without a path.
     """
     pipeline, links = problem.pipeline, problem.fabric.links.values()
     sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
@@ -794,13 +814,13 @@ def back_ns(problem: Problem, placement: Placement) -> int:
 
 
 def ordered_flows(pipeline: Pipeline) -> list[Flow]:
-    """Flows by their target, so that arrivals at one instant order by task."""
+    """Flows ordered by target; arrivals at one instant then have the order of tasks."""
     names = list(pipeline.tasks)
     return sorted(pipeline.flows, key=lambda flow: names.index(flow.target))
 
 
 def flow_rows(pipeline: Pipeline) -> Ints:
-    """Return where each flow of a pipeline is among the kernel's (see `ordered_flows`)."""
+    """Return the index of each flow of a pipeline among `ordered_flows`."""
     order = ordered_flows(pipeline)
     return np.array([order.index(flow) for flow in pipeline.flows], np.int64)
 
@@ -808,8 +828,8 @@ def flow_rows(pipeline: Pipeline) -> Ints:
 def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[ShadowPart]:
     """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 
-    A task is shadowed where it, or any task before it, runs on another node; a sink behind such
-    tasks discards what arrives. All other tasks are shared: their outputs are sent twice.
+    A task is shadowed if it, or any task before it, runs on another node; a sink behind such tasks
+    discards its inputs. All other tasks are shared: their outputs are sent twice.
     """
     diverging = pipeline.diverging(active, other)
     return [
@@ -823,7 +843,7 @@ def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> lis
 
 
 def _counted_ns(node: Node, quota: Quota) -> dict[str, int]:
-    """Quota without and with foreign threads, slack, least turn, and what is drawn at a time."""
+    """Quota without and with foreign threads, slack, least turn, and the slice drawn at once."""
     return {
         "quota_ns": max(round(node.budget_ms * 1e6), 1),
         "stressed_ns": max(round(node.stressed_budget_ms * 1e6), 1),
@@ -834,7 +854,7 @@ def _counted_ns(node: Node, quota: Quota) -> dict[str, int]:
 
 
 def _with_own_state(tables: Tables, first: Tables) -> tuple[NDArray[np.uint8], Tables]:
-    """Return a copy of the state of the first tables in one piece, and tables that have it."""
+    """Copy the state of the tables `first` into one block; return it, and tables that use it."""
     fields = Tables._fields
     changing = ("clock", "cells", *fields[fields.index("sites") :])
     old = {name: np.ascontiguousarray(getattr(first, name)) for name in changing}
@@ -849,7 +869,7 @@ def _with_own_state(tables: Tables, first: Tables) -> tuple[NDArray[np.uint8], T
 
 
 def _table(name: str, rows: Sequence[Mapping[str, Any]], room: int) -> Rows:
-    """Make a table of rows; what a row does not have is 0, as are all rows beyond them."""
+    """Make a table of rows and `room` empty rows; missing columns and empty rows are 0."""
     table = np.zeros(len(rows) + room, row_types()[name])
     for column in dict.fromkeys(key for row in rows for key in row):
         table[column][: len(rows)] = [row.get(column, 0) for row in rows]
@@ -857,5 +877,5 @@ def _table(name: str, rows: Sequence[Mapping[str, Any]], room: int) -> Rows:
 
 
 def _as_rows(name: str, table: NDArray[Any]) -> Rows:
-    """See a two-dimensional table as one of structs."""
+    """Return a view of a two-dimensional table as a table of structs."""
     return np.ascontiguousarray(table).view(row_types()[name]).reshape(len(table))

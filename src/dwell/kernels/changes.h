@@ -1,4 +1,5 @@
-// Changes of nodes: foreign threads come and go, a node goes down, loses its work, and is up again.
+// Changes of nodes: the number of foreign threads; a node that goes down, loses its work, and
+// recovers.
 #pragma once
 
 #include "cycles.h"
@@ -14,7 +15,7 @@ struct Progress {
   f64 received_ns;
 };
 
-// Those that run are counted first, then those that wait for cores and may have been preempted.
+// Progress of job `at` of a server: running jobs first, then jobs that wait for cores.
 template <class S>
 Progress progress(const S& s, const Server& server, i64 at) {
   i64 key;
@@ -36,7 +37,7 @@ Progress progress(const S& s, const Server& server, i64 at) {
   return {key, static_cast<f64>(site.need) * (alone - left)};
 }
 
-// Loses what runs or waits for cores on a server whose node goes down.
+// Loses the jobs that run or wait for cores on a server whose node goes down.
 template <class S>
 [[gnu::noinline]] void crash(S& s, Server& server, i64 now) {
   for (i64 i = 0; i < server.n_run + server.n_wait; ++i) {
@@ -54,13 +55,13 @@ template <class S>
   server.used = 0;
 }
 
-// Loses the inputs that wait on a node for the rest of their join.
+// Loses the inputs that wait on a node for the other inputs of their join.
 template <class S>
 [[gnu::noinline]] void lose_joins(S& s, i64 node) {
   for (i64 row = 0; row < s.slots.size; ++row) {
     const i64 cell = row / s.n_slots;
     const Slot& slot = s.slots[row];
-    // A shadow may have nothing under way and yet wait for what it shares with its parent.
+    // A shadow with no job or message in flight may still wait for tasks shared with its parent.
     if (slot.live == 0 && s.cell(cell).parent < 0) continue;
     for (i64 task = 0; task < s.cell(cell).n_tasks; ++task) {
       Job& job = s.jobs[row * s.n_tasks + task];
@@ -94,7 +95,7 @@ template <class S>
   if (is_down) lose_joins(s, node);
 }
 
-// Workers of a restarted node take what has come meanwhile, unless it is down again.
+// Gives the workers of a restarted node the jobs that wait, unless it is down again.
 template <class S>
 void restart(S& s, Site& site, i64 now) {
   if (site.ready_at_ns != now) return;

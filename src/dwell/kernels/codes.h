@@ -1,4 +1,4 @@
-// Codes that the tables hold; codes.py names those that Python uses (tests hold them equal).
+// Codes in the tables; codes.py repeats the codes that Python uses, and tests compare the two.
 #pragma once
 
 #include "rows.h"
@@ -8,27 +8,27 @@ namespace dwell {
 // Outcomes of cycles and jobs.
 enum Outcome : i8 { kInFlight, kDone, kDropped, kReplaced, kNodeDown };
 
-// `kTurns` is the scheduler of a fair node whose quota is noticed at ticks.
+// `kTurns` is the scheduler of a fair node whose quota takes effect at ticks.
 enum Scheduler : i8 { kFair, kFifo, kPriority, kTurns };
 
-// What a task is to the shadow of a cycle.
+// Role of a task for the shadow of a cycle.
 enum ShadowPart : i8 { kShared, kShadowed, kDiscarded };
 
-// What a call ends with. `kPaused`: `closed_cell` is to be decided on; stamp the next cycles and
-// call again. `kFinished`: no window is left to close. `kGrowEvents`, `kGrowRing`: enlarge the
-// queue, or the ring of cycles in flight, and call again; nothing was lost. `kStep`: the caller's
-// event `step_key` is due at `step_ns`. `kBusy`: the budget of events is spent; call again.
+// Status of a call. `kPaused`: a decision is due on `closed_cell`; stamp the next cycles and call
+// again. `kFinished`: all windows have ended. `kGrowEvents`, `kGrowRing`: enlarge the queue, or the
+// ring of cycles in flight, and call again; all state is kept. `kStep`: the caller's event
+// `step_key` is due at `step_ns`. `kBusy`: the budget of events is spent; call again.
 enum Status : i8 { kPaused, kFinished, kGrowEvents, kGrowRing, kStep, kBusy };
 
-// Built-in policies, and why they decide as they do.
+// Built-in policies, and the reasons of their decisions.
 enum Policy : i8 { kStatic, kDtp, kCusum, kLatencyFirst, kAtp };
 enum Reason : i8 { kDwell, kHold, kMove, kCapped, kInfeasible };
 
-// Tiers of nodes as J has them; of other nodes caps alone take notice.
+// Tiers of nodes in J; only the caps consider nodes without a tier.
 enum Tier : i8 { kRobot, kEdge, kCloud, kNoTier };
 
-// Kinds of events in the order in which equal times are handled. `kMigrate` and `kGuard` are steps
-// of the caller's: of a cold migration, and of the guard where it is woken.
+// Kinds of events, in the order in which events of one instant are handled. The caller handles
+// `kMigrate`, a step of a cold migration, and `kGuard`, if the guard is woken.
 enum Kind : i8 {
   kCompletion,
   kArrival,
@@ -43,8 +43,8 @@ enum Kind : i8 {
   kRelease,
 };
 
-// A key packs (kind, cell, cycle, item), so that keys order as the tuple does. The item is a task
-// or a flow of the cell, a site, or nothing, according to the kind.
+// A key packs (kind, cell, cycle, item), and keys have the order of these tuples. The kind
+// determines the item: a task or a flow of the cell, a site, a server, or nothing.
 constexpr int kItemBits = 14, kCycleBits = 32, kCellBits = 13;
 constexpr int kCycleShift = kItemBits;
 constexpr int kCellShift = kCycleShift + kCycleBits;
@@ -52,11 +52,11 @@ constexpr int kKindShift = kCellShift + kCellBits;
 constexpr i64 kItemMask = (i64{1} << kItemBits) - 1;
 constexpr i64 kCycleMask = (i64{1} << kCycleBits) - 1;
 constexpr i64 kCellMask = (i64{1} << kCellBits) - 1;
-// Marks an arrival that is the loss of a message; flows stay below it.
+// Marks an arrival event that loses the message; numbers of flows are smaller.
 constexpr i64 kLostOnLink = i64{1} << (kItemBits - 1);
-// Marks a job on the ready list that a worker has taken already; the kind's place is free there.
+// Marks a job on the ready list that a worker has already taken, in a bit of the kind, which is 0.
 constexpr i64 kTaken = i64{1} << kKindShift;
-// A foreign thread among those that wait for their turn, where jobs have their keys.
+// Key of a foreign thread in the heap of threads that wait for their turn.
 constexpr i64 kForeign = -1;
 
 constexpr i64 make_key(Kind kind, i64 cell, i64 cycle, i64 item) {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from enum import IntEnum
 
-#: Instant for events that never happen: the largest one that is exact as int64 and as float64.
+#: Instant for events that never happen: the largest that is exact as int64 and as float64.
 LAST_NS = (1 << 63) - 1024
 
 

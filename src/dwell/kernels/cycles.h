@@ -1,4 +1,4 @@
-// The life of a cycle: release, inputs, workers, completion, loss.
+// The events of a cycle: release, inputs, workers, completion, loss.
 #pragma once
 
 #include "links.h"
@@ -6,8 +6,8 @@
 
 namespace dwell {
 
-// Core time that a job has received that is done: its work, which takes more of it beside foreign
-// threads where they interfere.
+// Core time of a completed job: its work, and the extra core time caused by interfering foreign
+// threads.
 template <class S>
 i64 core_time(const S& s, const Job& job, i64 cycle) {
   const Site& site = s.site(job);
@@ -32,7 +32,7 @@ void log_job(S& s, i64 cell, i64 cycle, i64 task, const Job& job, Outcome outcom
   s.log_outcome[row] = outcome;
 }
 
-// Forgets what the logs have of an earlier cycle in the place of this one.
+// Clears the logs of the earlier cycle whose place this cycle takes.
 template <class S>
 void clear_log(S& s, i64 cell, i64 cycle) {
   if (S::kPlain || s.log.size == 0) return;
@@ -42,7 +42,7 @@ void clear_log(S& s, i64 cell, i64 cycle) {
   std::fill_n(&s.log_arrived[row * s.n_flows], s.n_flows, i64{-1});
 }
 
-// Loses a ready job, and with it its cycle.
+// Loses a ready job, and therefore its cycle.
 template <class S>
 void drop_job(S& s, i64 cell, i64 cycle, i64 task, Outcome outcome, i64 now) {
   log_job(s, cell, cycle, task, s.job(cell, cycle, task), outcome, now);
@@ -71,13 +71,13 @@ i64 pop_input(S& s, Site& site) {
   return cycle;
 }
 
-// Remembers that all inputs of a job are there; the event's end deals with it.
+// Puts a job whose inputs are complete on the ready list; `settle` handles it after the event.
 template <class S>
 void note_ready(S& s, i64 key) {
   s.ready[s.n_ready++] = key;
 }
 
-// Lets a ready job wait at its site, or loses it; true if an idle worker takes it at once.
+// Queues a ready job at its site, or loses it; returns true if an idle worker takes it at once.
 template <class S>
 bool become_ready(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   Job& job = s.job(cell, cycle, task);
@@ -104,7 +104,7 @@ bool become_ready(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   return false;
 }
 
-// Lets a worker that has become free take what waits, or be idle.
+// Gives a free worker the next waiting job; without one it becomes idle.
 template <class S>
 void free_worker(S& s, Site& site) {
   if (site.waiting == 0) {
@@ -115,13 +115,13 @@ void free_worker(S& s, Site& site) {
   note_ready(s, job_key(site.cell, cycle, site.task) | kTaken);
 }
 
-// Loses everything that waits at a site, because its node went down.
+// Loses all jobs that wait at a site, because its node went down.
 template <class S>
 void drop_waiting(S& s, Site& site, i64 now) {
   while (site.waiting > 0) drop_job(s, site.cell, pop_input(s, site), site.task, kNodeDown, now);
 }
 
-// Whether a task is one that the shadow of a cycle stops before.
+// Whether the shadow of a cycle stops before a task.
 template <class S>
 bool is_discarded(const S& s, i64 cell, i64 cycle, i64 task) {
   if (S::kPlain || s.cell(cell).parent < 0) return false;
@@ -139,14 +139,14 @@ i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
   return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
 }
 
-// A sink of a shadow has all that it waits for; the last one completes the shadow.
+// Counts a sink of a shadow that has all its inputs; the last sink completes the shadow.
 template <class S>
 void finish_shadow(S& s, i64 shadow, i64 cycle, i64 now) {
   if (--s.slot(shadow, cycle).sinks_left > 0) return;
   s.latency_ns[s.output(shadow, cycle)] = now - s.cell(shadow).release_ns[cycle];
 }
 
-// Counts an input in; the last one makes the job ready and names its critical path.
+// Counts an arrived input; the last input makes the job ready and determines its critical path.
 template <class S>
 void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   const Flow& ends = s.flow(cell, flow);
@@ -166,7 +166,7 @@ void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   }
 }
 
-// Handles a message that reaches its node, or that is lost on its link.
+// Handles a message that reaches its node, or is lost on its link.
 template <class S>
 void arrive(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   Outcome loss = kDropped;
@@ -182,7 +182,7 @@ void arrive(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   lose(s, cell, cycle, loss);
 }
 
-// A sink has completed; the last one completes the cycle.
+// Counts a completed sink; the last sink completes the cycle.
 template <class S>
 void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
   const i64 shadow = shared_by(s, cell, cycle, task);
@@ -196,6 +196,9 @@ void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
   s.latency_ns[row] = now - s.cell(cell).release_ns[cycle];
   s.compute_ns[row] = job.compute_ns;
   s.network_ns[row] = job.network_ns;
+  S::fetch_next(s.latency_ns[row]);
+  S::fetch_next(s.compute_ns[row]);
+  S::fetch_next(s.network_ns[row]);
 }
 
 // Hands a job's outputs over to tasks on its node, and sends the others.
@@ -203,7 +206,7 @@ template <class S>
 void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   const Task& from = s.task(cell, task);
   if (from.n_out > 1) s.slot(cell, cycle).live += from.n_out - 1;
-  // What a shadow shares is sent to it as well, after the cycle's own outputs.
+  // A shadow receives the outputs of shared tasks too, after the cycle's own outputs.
   const i64 shadow = shared_by(s, cell, cycle, task);
   i64 to = cell;
   while (true) {
@@ -218,7 +221,7 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
         hand_over(s, to, cycle, flow, now);
       } else {
         if (!S::kPlain && s.cell(to).parent >= 0) {
-          // No more than 64 bits hold, as with times.
+          // The sum is limited to 64 bits, like times.
           i64& bytes = s.shadow_bytes[s.cell(to).parent * s.clock[0].n_cycles + cycle];
           bytes = later(bytes, s.hops[hop].payload_bytes);
         }
@@ -230,7 +233,7 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   }
 }
 
-// Completes a job, unless its announcement has gone stale.
+// Completes a job, unless its announcement is invalid.
 template <class S>
 void complete(S& s, i64 key, i64 now) {
   const i64 cell = cell_of(key), cycle = cycle_of(key), task = item_of(key);
@@ -258,7 +261,7 @@ void retry(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   send(s, cell, cycle, flow, s.hop(cell, cycle, flow), attempt, now);
 }
 
-// Takes a job of a shadow from where it runs or waits; its worker takes what waits next.
+// Removes a running or waiting job of a shadow; its worker takes the next waiting job.
 template <class S>
 void withdraw(S& s, i64 key, Job& job, i64 now) {
   Site& site = s.site(job);
@@ -285,7 +288,7 @@ void withdraw(S& s, i64 key, Job& job, i64 now) {
   }
 }
 
-// Gives up the shadow that has been under way for too many cycles when this one is released.
+// Gives up a shadow that is still unfinished too many cycles later, when cycle `released` begins.
 template <class S>
 void give_up_before(S& s, i64 cell, i64 released, i64 now) {
   const Cell& of = s.cell(cell);
@@ -301,7 +304,7 @@ void give_up_before(S& s, i64 cell, i64 released, i64 now) {
   }
 }
 
-// Has every server with accelerators look whether a shadow job may begin there.
+// Marks every accelerator on which a shadow job waits: the job may be able to start.
 template <class S>
 void mark_accelerators(S& s) {
   for (i64 row = 0; row < s.servers.size; ++row) {
@@ -310,9 +313,10 @@ void mark_accelerators(S& s) {
   }
 }
 
-// Begins a cycle, or the shadow of one: its sources become ready.
+// Begins a cycle, or its shadow: the sources become ready.
 //
-// Of a shadow only sources that it does not share start, as those do that start later.
+// A shadow starts only the sources that it does not share, each by an event, like sources with an
+// offset.
 template <class S>
 void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now) {
   const Cell& of = s.cell(cell);
@@ -335,7 +339,7 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     if (fixed.n_in > 0) continue;
     if (is_shadow) {
       const i8 part = s.shadow_parts[pair * s.n_tasks + task];
-      if (part == kDiscarded) --sinks;  // there is nothing that it waits for
+      if (part == kDiscarded) --sinks;  // it has no inputs to wait for
       if (part != kShadowed) continue;
     }
     ++sources;
@@ -350,7 +354,7 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
   if (sinks == 0) s.latency_ns[s.output(cell, cycle)] = 0;
 }
 
-// Releases a cycle, and its shadow if it has one; the next release is announced.
+// Releases a cycle, and its shadow if it has one; announces the next release.
 template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
@@ -369,11 +373,13 @@ void release(S& s, i64 cell, i64 cycle, i64 now) {
   }
   const i64 following = cycle + 1;
   if (following < s.cell(cell).n_cycles) {
-    s.post(s.cell(cell).release_ns[following], make_key(kRelease, cell, following, 0));
+    const i64* release_ns = &s.cell(cell).release_ns[following];
+    s.post(*release_ns, make_key(kRelease, cell, following, 0));
+    S::fetch_next(*release_ns);
   }
 }
 
-// Deals with the jobs that the event has made ready.
+// Handles the jobs that the event has made ready.
 template <class S>
 void settle(S& s, i64 now) {
   for (i64 i = 0; i < s.n_ready; ++i) {
@@ -386,7 +392,7 @@ void settle(S& s, i64 now) {
   s.n_ready = 0;
 }
 
-// Gives out cores, and announces completions, on every server that the event touched.
+// Assigns cores, and announces completions, on every server that the event changed.
 template <class S>
 void flush(S& s, i64 now) {
   for (i64 i = 0; i < s.n_dirty; ++i) {

@@ -1,4 +1,4 @@
-// What nodes and links go through: the disturbances of each, which come and go, merged in time.
+// Changes of nodes and links: the disturbances of each, merged in time.
 
 #include <algorithm>
 #include <cstdint>
@@ -12,7 +12,7 @@ namespace {
 
 struct NodeState {
   int64_t threads;
-  int64_t down;  // effects by which it is down
+  int64_t down;  // number of effects that keep it down
 };
 
 bool before(const NodeEffect& one, const NodeEffect& other) noexcept {
@@ -21,7 +21,7 @@ bool before(const NodeEffect& one, const NodeEffect& other) noexcept {
   return at_ns != other_ns ? at_ns < other_ns : one.node < other.node;
 }
 
-// Moves the effect at i of a binary heap down until none below it changes sooner.
+// Moves the effect at i of a binary heap down until no effect below it changes sooner.
 void sift_down(NodeEffect** heap, int64_t count, int64_t i) noexcept {
   for (int64_t below = 2 * i + 1; below < count; below = 2 * i + 1) {
     if (below + 1 < count && before(*heap[below + 1], *heap[below])) ++below;
@@ -45,7 +45,7 @@ DWELL_EXPORT int64_t dwell_node_changes(NodeEffect** effects, int64_t count, int
     NodeState& state = nodes[next.node];
     state.threads += sign * next.threads[level(next.intervals)];
     state.down += sign * next.down;
-    // Of what changes at one instant, the node's state after all of it counts.
+    // Several changes of a node at one instant give one row, with the last state.
     const bool again =
         made > 0 && changes[made - 1].at_ns == at_ns && changes[made - 1].node == next.node;
     made += again ? 0 : 1;
@@ -56,8 +56,8 @@ DWELL_EXPORT int64_t dwell_node_changes(NodeEffect** effects, int64_t count, int
   return made;
 }
 
-// Merges the faults of one link, whose own state is given as its first segment; returns the number
-// of segments.
+// Merges the faults of one link, given its undisturbed state as the first segment; returns the
+// number of segments.
 DWELL_EXPORT int64_t dwell_link_segments(LinkFault* faults, int64_t count, Segment* segments,
                                          Rate* rates) noexcept {
   const Segment own = segments[0];

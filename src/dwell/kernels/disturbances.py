@@ -78,8 +78,8 @@ def link_segments(
 ) -> tuple[Ints, Floats]:
     """Return the segments of a link, as the two tables of `LinkSegments`.
 
-    The tables have the shapes (segments, 4) and (segments, 2). `rate_mbps` and `loss` are those of
-    the undisturbed link.
+    The tables have the shapes (segments, 4) and (segments, 2). `rate_mbps` and `loss` describe the
+    undisturbed link.
     """
     kind, shares = structs()["LinkFault"], PLAIN["Shares"]
     rows = (kind * len(faults))(

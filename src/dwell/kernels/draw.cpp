@@ -1,5 +1,5 @@
-// Draws a path of a random process, one value a cycle: independent values, or those of an AR(1)
-// process; as they are, or in whole nanoseconds.
+// Samples a path of a random process, one value per cycle: independent values, or an AR(1) process;
+// as floating-point numbers, or in whole nanoseconds.
 
 #include <algorithm>
 #include <bit>
@@ -21,10 +21,10 @@ constexpr int64_t kUniform = 1;
 constexpr int64_t kNormal = 2;
 constexpr int64_t kLogNormal = 3;
 
-// Values at a time: they stay in the first-level cache.
+// Values per block, which stay in the first-level cache.
 constexpr int64_t kBlock = 512;
 
-// x[t] = r x[t-1] + sqrt(1 - r^2) e[t]; the first of all is e[0] itself.
+// x[t] = r x[t-1] + sqrt(1 - r^2) e[t]; x[0] = e[0].
 void remember(DrawnPath& path, double* normals, int64_t count) noexcept {
   const bool begins = std::isnan(path.last);
   double last = begins ? normals[0] : path.last;
@@ -64,10 +64,10 @@ void draw_block(DrawnPath& path, double* values, int64_t count) noexcept {
   }
 }
 
-// Turns milliseconds into whole nanoseconds.
+// Rounds milliseconds to whole nanoseconds.
 void round_block(const double* ms, int64_t count, int64_t* ns) noexcept {
-  // Where a number is below 2^51 (26 days), the last bits of the sum are the whole number, and the
-  // others are those of the summand.
+  // For a number below 2^51 (26 days), the last bits of the sum are the whole number, and its first
+  // bits equal the first bits of the summand.
   constexpr uint64_t kRound = std::bit_cast<uint64_t>(0x1.8p52);
   uint64_t all = 0;
   for (int64_t i = 0; i < count; ++i) {
@@ -85,14 +85,14 @@ void scale_block(double* values, const double* factors, int64_t count) noexcept 
 
 }  // namespace
 
-// Draws the next values of a path.
+// Samples the next values of a path.
 DWELL_EXPORT void dwell_draw(DrawnPath* path, int64_t count, double* values) noexcept {
   for (int64_t i = 0; i < count; i += kBlock) {
     draw_block(*path, values + i, std::min(kBlock, count - i));
   }
 }
 
-// Draws the next values of a path, ms, times factors where there are any, and rounds them to ns.
+// Samples the next values of a path, ms, multiplies them by factors unless null, and rounds to ns.
 DWELL_EXPORT void dwell_draw_ns(DrawnPath* path, int64_t count, const double* factors,
                                 int64_t* ns) noexcept {
   double block[kBlock];
@@ -104,7 +104,7 @@ DWELL_EXPORT void dwell_draw_ns(DrawnPath* path, int64_t count, const double* fa
   }
 }
 
-// Rounds values in ms, times factors where there are any, to ns.
+// Multiplies values, ms, by factors unless null, and rounds them to ns.
 DWELL_EXPORT void dwell_round_ns(const double* ms, int64_t count, const double* factors,
                                  int64_t* ns) noexcept {
   double block[kBlock];

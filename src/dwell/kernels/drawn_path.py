@@ -47,7 +47,7 @@ def independent(process: Process) -> bool:
 
 
 class Path(ABC):
-    """Values of one process, in order; each call returns or fills in the next ones."""
+    """Values of one process, in order; each call continues after the previous call."""
 
     @abstractmethod
     def values(self, count: int) -> Floats:
@@ -124,8 +124,8 @@ def _row(process: Process) -> dict[str, float] | None:
 
 
 def _logarithm(process: LogNormal | AR1) -> dict[str, float]:
-    mu, sigma = LogNormal(process.mean, process.cv).log_parameters
-    # Values below e^-600 ms are 0 ns, too, and the kernel's exponential is exact only from -700 on.
+    mu, sigma = process.log_parameters
+    # Values below e^-600 ms round to 0 ns; the kernel's exponential needs arguments from -700 on.
     return {"kind": LOGNORMAL, "location": max(mu, -600.0), "spread": sigma}
 
 

@@ -1,7 +1,7 @@
 #pragma once
 
-// Elementary functions of our own: the same bits from every compiler and on every processor, where
-// those of the C library differ from one processor to the next. All of them round to nearest.
+// Elementary functions with the same bits from every compiler and on every processor; the functions
+// of the C library differ between processors. All operations round to nearest.
 
 #include <bit>
 #include <cstdint>
@@ -12,19 +12,19 @@ namespace dwell {
 
 // e^x to within 0.52 ulp, for |x| <= 700.
 inline double exp(double x) noexcept {
-  // The nearest multiple of log(2)/128, n of them: the sum's last bits are n. What is left is below
-  // 0.0028; log(2)/128 in two parts, so that the first product is exact.
+  // n: the nearest multiple of log(2)/128, in the last bits of the sum. The rest is below 0.0028.
+  // log(2)/128 is split into two parts to make the first product exact.
   constexpr double kRound = 0x1.8p52;
   const double shifted = x * 0x1.71547652b82fep+7 + kRound;
   const double n = shifted - kRound;
   const double rest = (x - n * 0x1.62e42fefa0000p-8) - n * 0x1.cf79abc9e3b3ap-47;
 
-  // Taylor's series of e^rest - 1: the first term that is left out is below 2^-59.
+  // Taylor series of e^rest - 1: the first omitted term is below 2^-59.
   const double square = rest * rest;
   const double terms =
       rest + square * ((1.0 / 2 + rest * (1.0 / 6)) + square * (1.0 / 24 + rest * (1.0 / 120)));
 
-  // 2^(n/128): its fraction from a table, the whole of its exponent into the exponent's bits.
+  // 2^(n/128): n % 128 selects the table entry, and n / 128 is added to its exponent.
   const uint64_t bits = std::bit_cast<uint64_t>(shifted);
   const uint64_t fraction = bits % 128;
   const double power =
@@ -32,7 +32,7 @@ inline double exp(double x) noexcept {
   return power + power * (terms + kPowerLost[fraction]);
 }
 
-// Natural logarithm to within 1 ulp, for x from 2^-1022 on that is finite.
+// Natural logarithm to within 1 ulp, for finite x from 2^-1022 on.
 inline double log(double x) noexcept {
   // x = 2^n (1 + f), where 1 + f is between sqrt(1/2) and sqrt(2).
   constexpr uint64_t kSqrtHalf = std::bit_cast<uint64_t>(0x1.6a09e667f3bcdp-1);
@@ -42,7 +42,7 @@ inline double log(double x) noexcept {
   const double f = std::bit_cast<double>(bits - (static_cast<uint64_t>(exponent) << 52)) - 1.0;
 
   // With s = f / (2 + f): log(1 + f) = 2 (s + s^3/3 + s^5/5 + ...) = f - s (f - 2 (s^2/3 + ...));
-  // the first term that is left out is below 2^-66.
+  // the first omitted term is below 2^-66.
   const double s = f / (2.0 + f);
   const double z = s * s;
   double terms = 2.0 / 23;
@@ -58,7 +58,7 @@ inline double log(double x) noexcept {
   terms = terms * z + 2.0 / 3;
   const double half = 0.5 * f * f;
 
-  // log(2) in two parts, so that n times the first is exact.
+  // log(2) is split into two parts to make the product of n and the first part exact.
   return n * 0x1.62e42fefa0000p-1 -
          ((half - (s * (half + z * terms) + n * 0x1.cf79abc9e3b3ap-40)) - f);
 }
@@ -66,7 +66,7 @@ inline double log(double x) noexcept {
 // Cube root to within 0.67 ulp, for 0 and for x from 2^-1022 to 2^1021.
 inline double cube_root(double x) noexcept {
   if (x == 0.0) return x;
-  // A third of the exponent: off by 4 % at most. Each step of Halley's method cubes the error.
+  // A third of the exponent: an error of 4 % at most. Each step of Halley's method cubes the error.
   constexpr uint64_t kTwoThirds = 0x2a9f789300000000;
   double root = std::bit_cast<double>(std::bit_cast<uint64_t>(x) / 3 + kTwoThirds);
   for (int step = 0; step < 2; ++step) {
@@ -74,7 +74,7 @@ inline double cube_root(double x) noexcept {
     root *= (cube + 2.0 * x) / (2.0 * cube + x);
   }
 
-  // The last step begins with 23 bits, so that the square is exact.
+  // Round to 23 bits before the last step to make the square exact.
   constexpr uint64_t kHalf = uint64_t{1} << 29;
   root = std::bit_cast<double>((std::bit_cast<uint64_t>(root) + kHalf) & ~(2 * kHalf - 1));
   const double quotient = x / (root * root);
@@ -88,14 +88,14 @@ struct SineCosine {
 
 // Sine and cosine of an angle, rad, to within 1 ulp for |angle| < 10^8.
 inline SineCosine sine_cosine(double angle) noexcept {
-  // The nearest multiple of pi/2, n of them: the sum's last bits are n.
+  // n: the nearest multiple of pi/2, in the last bits of the sum.
   constexpr double kRound = 0x1.8p52;
   const double shifted = angle * 0x1.45f306dc9c883p-1 + kRound;
   const uint64_t quadrant = std::bit_cast<uint64_t>(shifted) & 3;
   const double n = shifted - kRound;
 
-  // What is left of the angle (Cody and Waite): pi/2 in parts of 26 bits, so that products and the
-  // first two differences are exact; then x + tail has twice a double's digits.
+  // The rest of the angle (Cody and Waite). pi/2 is split into parts of 26 bits to make the
+  // products and the first two differences exact; x + tail then has twice the digits of a double.
   const double rest = (angle - n * 0x1.921fb50000000p+0) - n * 0x1.110b460000000p-26;
   const double third = n * 0x1.1a62630000000p-54;
   const double left = rest - third;
@@ -105,7 +105,7 @@ inline SineCosine sine_cosine(double angle) noexcept {
   const double x = left + small;
   const double tail = (left - x) + small;
 
-  // Taylor's series: the first term that is left out is below 2^-57 of the sum.
+  // Taylor series: the first omitted term is below 2^-57 of the sum.
   const double z = x * x;
   double sine_terms = 1.0 / 355687428096000;
   sine_terms = sine_terms * z - 1.0 / 1307674368000;

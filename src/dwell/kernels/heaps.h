@@ -1,4 +1,4 @@
-// Binary heaps of a server's jobs: those that run, and those that wait for its cores.
+// Binary heaps of a server's jobs: running jobs, and jobs that wait for its cores.
 #pragma once
 
 #include "rows.h"
@@ -15,7 +15,7 @@ inline bool operator<(const Waiting& a, const Waiting& b) {
   return a.key < b.key;
 }
 
-// Puts a row into a heap, where there is a hole at `i`: towards the root as far as it goes before.
+// Puts a row into the free place `i` of a heap, and moves it towards the root past larger rows.
 template <class Row>
 i64 rise(Row* heap, i64 i, const Row& row) {
   while (i > 0) {

@@ -1,4 +1,4 @@
-// Sums of times that 64 bits may not hold: what is beyond `kLastNs` is at it, and never comes.
+// Sums of times that may exceed 64 bits: later instants become `kLastNs`, which is never reached.
 #pragma once
 
 #include <algorithm>

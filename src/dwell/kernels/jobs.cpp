@@ -1,4 +1,4 @@
-// What the jobs of a window say of waits, and of foreign threads beside them.
+// Waits of a window's jobs, and foreign threads on their nodes.
 
 #include <algorithm>
 #include <cmath>
@@ -8,11 +8,11 @@
 
 namespace dwell {
 
-// A job that has completed; `row` and `task` are where its numbers are.
+// A completed job; `row` and `task` are its place in the window.
 struct RanJob {
   f64 start_ns, end_ns, alone_ns, cores;
-  f64 threads, slowed;  // foreign threads that it ran beside, and how many times as long as alone
-  f64 used, above;      // threads of all cells' jobs next to it, and of those that go first
+  f64 threads, slowed;  // foreign threads next to it; its duration over its time alone
+  f64 used, above;      // mean threads of jobs on its server, and of jobs that go before it
   i64 row, task;
 
   f64 taken_ns() const { return std::max(end_ns - start_ns, 1.0); }
@@ -40,16 +40,16 @@ struct Uses {
   i64 n;
 };
 
-// Share of their time alone by which most jobs of a task must have waited, and fewest jobs.
+// Least typical wait of a task's jobs, as a share of their time alone; fewest jobs of a task.
 constexpr f64 kLeastWait = 0.05;
 constexpr i64 kJobs = 3;
-// So much longer than alone jobs take that are slowed, and such a share of them are most.
+// Least duration of a slowed job over its time alone; least share of a task's jobs that is "most".
 constexpr f64 kSlowed = 1.02, kMost = 0.9;
-// Deviations that are a change within a window, of at least so many values.
+// Deviations that show a change within a window; fewest values for this test.
 constexpr f64 kChanged = 5.0;
 constexpr i64 kLeast = 36;
 
-// Without it, std::sort of numbers is a function of the C++ library with clang, which links none.
+// Without this comparison clang's std::sort of numbers calls the C++ library, which is not linked.
 constexpr auto kIsLess = [](f64 one, f64 other) { return one < other; };
 
 f64 median(f64* values, i64 n) {
@@ -59,7 +59,7 @@ f64 median(f64* values, i64 n) {
   return (*std::max_element(values, middle) + *middle) / 2.0;
 }
 
-// Whether jobs took longer than they would have alone, most of them by `kLeastWait`.
+// Whether the median wait of jobs exceeds `kLeastWait` of their median time alone.
 template <class Taken>
 bool is_longer(const RanJob* jobs, i64 n, f64* scratch, Taken taken_ns) {
   f64 longer_ns = 0.0, alone_ns = 0.0;
@@ -67,7 +67,7 @@ bool is_longer(const RanJob* jobs, i64 n, f64* scratch, Taken taken_ns) {
     longer_ns += taken_ns(jobs[i]) - jobs[i].alone_ns;
     alone_ns += jobs[i].alone_ns;
   }
-  // Where most are longer, all together are; to add up takes less than to look for the middle.
+  // A sum is faster than a median: if most jobs waited, so did all jobs together.
   if (longer_ns <= kLeastWait / 4 * alone_ns) return false;
   for (i64 i = 0; i < n; ++i) scratch[i] = taken_ns(jobs[i]) - jobs[i].alone_ns;
   const f64 middle_ns = median(scratch, n);
@@ -75,7 +75,7 @@ bool is_longer(const RanJob* jobs, i64 n, f64* scratch, Taken taken_ns) {
   return middle_ns > kLeastWait * median(scratch, n);
 }
 
-// Cores that jobs use, from each begin or end of one of them on.
+// Cores that jobs use over time; each begin or end of a job starts a new row.
 Uses uses_of(Jobs jobs, CoreUse* out) {
   for (i64 i = 0; i < jobs.n; ++i) {
     const RanJob& job = jobs.first[i];
@@ -90,7 +90,7 @@ Uses uses_of(Jobs jobs, CoreUse* out) {
   return uses;
 }
 
-// Integrates what has a rate from each instant on until the next.
+// Integrates a rate that is constant between successive instants.
 template <class Rate>
 void integrate(Uses uses, Rate rate) {
   CoreUse* use = uses.first;
@@ -114,15 +114,15 @@ f64 area_during(Uses uses, const RanJob& job) {
   return area_until(uses, job.end_ns) - area_until(uses, job.start_ns);
 }
 
-// Cores that others used in the mean while a job ran, its own if it is one of them.
+// Mean cores that the jobs of `uses` used while a job ran; the job itself counts if it is included.
 f64 used_beside(Uses uses, const RanJob& job) {
   return uses.n == 0 ? 0.0 : area_during(uses, job) / job.taken_ns();
 }
 
-// Where the columns of a cycle's own jobs begin, and of its shadow's.
+// Number of columns of a cycle; the columns of its shadow follow.
 i64 width_of(const NodeJobs& node) { return 1 + 4 * node.n_tasks + node.n_flows; }
 
-// Adds the job of a task to `out`, if it is known how long it took.
+// Writes the job of a task to `out`, if its duration and core time are known.
 bool add_job(const NodeJobs& node, const Window& window, i64 begin, i64 row, i64 task,
              RanJob& out) {
   const i64* cycle = window.rows + row * window.width + begin;
@@ -142,7 +142,7 @@ bool runs_on(const NodeJobs& node, i64 candidate) {
   return std::any_of(cores, cores + node.n_tasks, [](f64 one) { return one > 0.0; });
 }
 
-// The lowest candidate above one that cycles, or shadows, went through; -1 if there is none.
+// The lowest candidate above `after` in the column `begin` of cycles, or of shadows; -1 for none.
 i64 next_candidate(const Window& window, i64 begin, i64 after) {
   i64 next = -1;
   for (i64 i = 0; i < window.n; ++i) {
@@ -152,8 +152,8 @@ i64 next_candidate(const Window& window, i64 begin, i64 after) {
   return next;
 }
 
-// Adds to the work of the jobs of a node what most jobs of a task waited for, of the cycles under
-// one candidate.
+// Adds waits to the work of a node's jobs, for the tasks whose typical job waited; the cycles are
+// under one candidate.
 [[gnu::noinline]] void add_waits(const NodeJobs& node, const Window& window, i64 candidate,
                                  RanJob* jobs) {
   const i64 room = window.n * node.n_tasks;
@@ -176,13 +176,13 @@ i64 next_candidate(const Window& window, i64 begin, i64 after) {
     }
   }
   const auto took_ns = [](const RanJob& job) { return job.end_ns - job.start_ns; };
-  // Most tasks took no longer than their core time says, and need not be looked at again.
+  // The jobs of most tasks took no longer than their core time; skip the rest then.
   each_task([&](const RanJob* first, i64 n) {
     any |= n >= kJobs && is_longer(first, n, scratch, took_ns);
   });
   if (!any) return;
   const Uses uses = uses_of(all, uses_out);
-  // Cores for each that a job wants: what it would have had, had it waited for nothing.
+  // Share of its wanted cores that a job gets if it waits only for other running threads.
   integrate(uses, [&](f64 used) {
     return std::min(node.spare / std::max(used + node.foreign, 1e-9), 1.0);
   });
@@ -198,8 +198,8 @@ i64 next_candidate(const Window& window, i64 begin, i64 after) {
   });
 }
 
-// The first of a window's values since its last change, if there was one; else 0. The quarters
-// before and after a change differ in their ranks; infinite values are the largest.
+// The first of a window's values after its last change; 0 without a change. A change is sought
+// after each quarter of the values, by the mean ranks before and after; infinite values rank last.
 i64 newest(const f64* values, i64 n, f64* scratch) {
   if (n < kLeast) return 0;
   std::copy(values, values + n, scratch);
@@ -229,8 +229,8 @@ i64 newest(const f64* values, i64 n, f64* scratch) {
   return most >= kChanged ? best : 0;
 }
 
-// The jobs of the CPU of a node, of all cycles or of all shadows, candidate after candidate; next
-// to how many threads of all cells each ran, where that is logged.
+// The jobs on the CPU of a node, of all cycles or of all shadows, candidate after candidate; with
+// the mean number of threads of all cells next to each, if logged.
 Jobs jobs_on(const NodeJobs& node, const Window& window, i64 begin, const i64* beside, RanJob* out,
              bool* any) {
   const i64 parts = window.width > width_of(node) ? 2 : 1;
@@ -255,7 +255,7 @@ Jobs jobs_on(const NodeJobs& node, const Window& window, i64 begin, const i64* b
   return jobs;
 }
 
-// Foreign threads that share with shadow jobs what own jobs leave.
+// Foreign threads that share the cores left by own jobs with shadow jobs.
 f64 threads_behind(f64 slowed, f64 spare, f64 mine, f64 own) {
   f64 threads = std::max(slowed * std::max(spare - own, 0.0) - mine, 0.0);
   for (i64 i = 0; i < 2; ++i) {
@@ -266,8 +266,8 @@ f64 threads_behind(f64 slowed, f64 spare, f64 mine, f64 own) {
   return threads;
 }
 
-// The same next to the jobs of all cells, which may fill the node: of s threads own jobs leave
-// c s / (own + s) where all are slowed.
+// The same if cells share the node, whose jobs may fill it: if all threads are slowed, own jobs
+// leave c s / (own + s) cores to s foreign threads.
 f64 threads_behind_all(f64 slowed, f64 spare, f64 mine, f64 own) {
   const f64 free = slowed * (spare - own) - mine;
   if (free > 0.0 && own + free <= spare) return free;
@@ -275,8 +275,8 @@ f64 threads_behind_all(f64 slowed, f64 spare, f64 mine, f64 own) {
   return std::max(half + std::sqrt(std::max(half * half - own * mine, 0.0)), 0.0);
 }
 
-// Keeps of the jobs of each task those since its last change, of those tasks alone whose jobs are
-// slowed, if there are any; returns whether there are.
+// Keeps the jobs of each task since the task's last change. If most jobs of some tasks are slowed,
+// keeps only these tasks and returns true.
 bool keep_newest(Jobs& jobs, f64* scratch) {
   std::sort(jobs.begin(), jobs.end(), [](const RanJob& one, const RanJob& other) {
     if (one.task != other.task) return one.task < other.task;
@@ -309,19 +309,20 @@ bool keep_newest(Jobs& jobs, f64* scratch) {
 
 using namespace dwell;
 
-// Adds waits to the work of the window's own jobs, on each of some nodes.
+// Copies a window, and adds waits to the work of its own jobs on some nodes.
 DWELL_EXPORT void dwell_add_waits(const NodeJobs* nodes, i64 n_nodes, const Window* window,
-                                  RanJob* scratch) noexcept {
-  for (i64 one = -1; (one = next_candidate(*window, 0, one)) >= 0;) {
+                                  RanJob* scratch, const Window* out) noexcept {
+  std::copy(window->rows, window->rows + window->n * window->width, out->rows);
+  for (i64 one = -1; (one = next_candidate(*out, 0, one)) >= 0;) {
     for (i64 i = 0; i < n_nodes; ++i) {
-      if (runs_on(nodes[i], one)) add_waits(nodes[i], *window, one, scratch);
+      if (runs_on(nodes[i], one)) add_waits(nodes[i], *out, one, scratch);
     }
   }
 }
 
-// Tells from the jobs on a node beside how many foreign threads they ran since the last change,
-// with the standard error, into `out`: 0 where they say nothing, 2 where most are slowed, else 1.
-// `beside` is what `dwell_logged_window` has written of a node that cells share, else null.
+// Estimates from the jobs on a node the number of foreign threads since the last change, and its
+// standard error, into `out`. Returns 0 if there are too few jobs, 2 if most jobs of a task are
+// slowed, else 1. `beside` is the output of `dwell_logged_window` for a shared node, else null.
 DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i64* beside,
                              i64 shadows, RanJob* scratch, f64* out) noexcept {
   const i64 room = window->n * node->n_tasks;
@@ -361,7 +362,8 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   const bool is_slowed = keep_newest(jobs, values);
   for (i64 i = 0; i < jobs.n; ++i) values[i] = jobs.first[i].threads;
   std::sort(values, values + jobs.n, kIsLess);
-  // The middle of what ran beside none of the bursts, which come for less of the time.
+  // The median of the jobs outside bursts; they have the smaller values, because bursts add
+  // threads.
   const f64 place = (1.0 - node->bursts) / 2;
   const f64 off = std::sqrt(place * (1.0 - place) / static_cast<f64>(jobs.n));
   const auto at = [&](f64 share) {
@@ -372,13 +374,15 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   return is_slowed ? 2 : 1;
 }
 
-// What has to be looked at in a window: 1 where an own job that began before the limit has not
-// ended, 2 where the work of an own job that has ended is not known, 4 where a shadow's is not.
+// Returns the flaws of a window as a sum: 1 if an own job that began before the limit is
+// unfinished, 2 if the work of a completed own job is unknown, 4 for a completed shadow job, 8 if
+// its cycles have several candidates.
 DWELL_EXPORT i64 dwell_unknown(i64 n_tasks, i64 n_flows, const Window* window,
                                i64 limit_ns) noexcept {
   i64 found = 0;
   const i64 width = 1 + 4 * n_tasks + n_flows;
   for (i64 i = 0; i < window->n; ++i) {
+    if (window->rows[i * window->width] != window->rows[0]) found |= 8;
     for (i64 begin = 0; begin < window->width; begin += width) {
       const i64* ready_ns = window->rows + i * window->width + begin + 1;
       const i64 *end_ns = ready_ns + n_tasks, *work_ns = end_ns + n_tasks + n_flows;

@@ -57,49 +57,74 @@ class WaitingJobs:
         self._nodes, self._flows = tuple(nodes), flows
         rows = [node.row(flows) for node in nodes]
         self._rows: Array[Any] = (structs()["NodeJobs"] * len(rows))(*rows)
-        # Reuse the memory: to allocate it takes longer than the computation.
-        self._scratch = np.empty(0)
+        self._scratch = _Scratch()
+        self._out = WindowRows(np.empty((0, 0), np.int64), 0, 0)
 
     def __reduce__(self) -> tuple[type[WaitingJobs], tuple[Sequence[NodeJobs], int]]:
         # A copy needs its own addresses.
         return WaitingJobs, (self._nodes, self._flows)
 
-    def add(self, window: WindowRows, foreign_threads: Sequence[float]) -> None:
-        """Add the typical wait of each task's jobs to the work of own jobs in a window."""
+    def added(self, window: WindowRows, foreign_threads: Sequence[float]) -> WindowRows:
+        """Return a window with the typical wait of each task's jobs in the work of own jobs.
+
+        The next call overwrites the result.
+        """
         for row, threads in zip(self._rows, foreign_threads, strict=True):
             row.foreign = threads
-        if len(self._scratch) < len(window.table) * window.tasks * SCRATCH:
-            self._scratch = _scratch(window)
-        of = self._scratch.ctypes.data
-        _add_waits()(self._rows, len(self._rows), byref(window.row), of)
+        if self._out.table.shape != window.table.shape:
+            self._out = WindowRows(np.empty_like(window.table), window.tasks, window.flows)
+        of, out = byref(window.row), byref(self._out.row)
+        _add_waits()(self._rows, len(self._rows), of, self._scratch.address(window), out)
+        return self._out
 
 
-def level(
-    node: NodeJobs, window: WindowRows, *, shadows: bool, is_shared: bool = False
-) -> tuple[float, float, bool] | None:
-    """Estimate the number of foreign threads on a node since their last change.
+class SlowedJobs:
+    """Estimates the number of foreign threads on a node from the jobs of windows."""
 
-    Parameters
-    ----------
-    shadows : bool
-        Whether shadow jobs count if own jobs are too few.
-    is_shared : bool
-        Whether jobs of other cells run on the node, too (`WindowRows.beside`).
+    def __init__(self, node: NodeJobs, flows: int) -> None:
+        self._node, self._flows = node, flows
+        self._row, self._scratch = node.row(flows), _Scratch()
 
-    Returns
-    -------
-    tuple of (threads, error, is_slowed), or None
-        See `dwell.estimators.foreign_threads.Level`; None if the jobs allow no estimate.
-    """
-    out, row, scratch = (c_double * 2)(), node.row(window.flows), _scratch(window)
-    beside = window.beside_address if is_shared else None
-    found = _level()(byref(row), byref(window.row), beside, shadows, scratch.ctypes.data, out)
-    return (out[0], out[1], found == 2) if found else None
+    def __reduce__(self) -> tuple[type[SlowedJobs], tuple[NodeJobs, int]]:
+        # A copy needs its own addresses.
+        return SlowedJobs, (self._node, self._flows)
+
+    def level(
+        self, window: WindowRows, *, shadows: bool, is_shared: bool = False
+    ) -> tuple[float, float, bool] | None:
+        """Estimate the number of foreign threads since their last change.
+
+        Parameters
+        ----------
+        shadows : bool
+            Whether shadow jobs count if own jobs are too few.
+        is_shared : bool
+            Whether jobs of other cells run on the node, too (`WindowRows.beside`).
+
+        Returns
+        -------
+        tuple of (threads, error, is_slowed), or None
+            See `dwell.estimators.foreign_threads.Level`; None if the jobs allow no estimate.
+        """
+        out, beside = (c_double * 2)(), window.beside_address if is_shared else None
+        of = byref(self._row), byref(window.row), beside, shadows
+        found = _level()(*of, self._scratch.address(window), out)
+        return (out[0], out[1], found == 2) if found else None
 
 
-def _scratch(window: WindowRows) -> Floats:
-    return np.empty(len(window.table) * window.tasks * SCRATCH)
+class _Scratch:
+    """Memory for the jobs of a window; its allocation takes longer than the computation."""
+
+    def __init__(self) -> None:
+        self._memory, self._address = np.empty(0), 0
+
+    def address(self, window: WindowRows) -> int:
+        """Return the address of enough memory."""
+        if len(self._memory) < len(window.table) * window.tasks * SCRATCH:
+            self._memory = np.empty(len(window.table) * window.tasks * SCRATCH)
+            self._address = self._memory.ctypes.data
+        return self._address
 
 
-_add_waits = foreign("dwell_add_waits", None, c_void_p, c_int64, c_void_p, c_void_p)
+_add_waits = foreign("dwell_add_waits", None, c_void_p, c_int64, *(c_void_p,) * 3)
 _level = foreign("dwell_level", c_int64, *(c_void_p,) * 3, c_int64, *(c_void_p,) * 2)

@@ -1,4 +1,4 @@
-// The fields of every row, of which Python makes its own structs, and the types of its arrays.
+// The fields of every row, from which Python builds its own structs and array types.
 
 #include "export.h"
 #include "rows.h"
@@ -12,8 +12,8 @@ struct Field {
   const char* type;
 };
 
-// Writes the fields of all rows, where `out` is given, then every table as a field of `Tables`,
-// with the type of its own rows; returns how many these are.
+// Writes the fields of all rows, then every table as a field of `Tables` with the type of its rows,
+// unless `out` is null; returns the number of fields.
 i64 describe(Field* out) {
   i64 n = 0;
   const auto add = [&](const Field& field) {

@@ -1,8 +1,8 @@
-// What the library says of itself. The loader compares the digest with the sources beside it.
+// Digest and compiler of the library. The loader compares the digest with the sources.
 
 #include "export.h"
 
-// The build hook (hatch_build.py) defines both; without it the library is nobody's.
+// The build hook (hatch_build.py) defines both; the loader rejects a library built without it.
 #ifndef DWELL_DIGEST
 #define DWELL_DIGEST ""
 #endif

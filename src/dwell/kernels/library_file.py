@@ -49,7 +49,7 @@ class LibraryHeader(NamedTuple):
 
 
 def read_header(content: bytes) -> LibraryHeader | None:
-    """Return the header; None if the content does not begin like an ELF file."""
+    """Return the header, or None if the content is no ELF file."""
     if len(content) < _HEADER.size:
         return None
     magic, machine, sections, entry_bytes, entries = _HEADER.unpack_from(content)

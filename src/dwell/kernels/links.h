@@ -9,14 +9,14 @@
 
 namespace dwell {
 
-// Where a link has no timeout of its own, state that was lost is sent again after Linux's least TCP
-// retransmission timeout.
+// Linux's least TCP retransmission timeout: lost state is sent again after this time on links that
+// have no timeout.
 constexpr i64 kStateTimeoutNs = 200'000'000;
 
-// When the link can take a message; its current segment becomes the one of that instant.
+// Instant at which the link can take a message; updates the link's current segment.
 //
-// A link that drops takes it at once even while it is down, to lose it; one that retransmits holds
-// it back to the end of the outage, if there is one.
+// A link that drops messages takes and loses them even while it is down. A link that retransmits
+// holds a message back until the end of the outage.
 template <class S>
 i64 begin(const S& s, Link& link, i64 now) {
   i64 start = std::max(now, link.free_ns);
@@ -41,18 +41,21 @@ inline bool loses(const Hop& hop, const Rate& rate, i64 cycle, i64 attempt) {
   return rate.loss > 0.0 && attempt_uniform(hop.loss_key, cycle, attempt) < rate.loss;
 }
 
-// Delay of a message, extra delays of what is active included.
+// Delay of a message, with the extra delays of active layers.
 template <class S>
 i64 propagation_ns(const S& s, i64 hop, const Segment& segment, i64 cycle) {
   i64 delay = s.hops[hop].delay_ns[cycle];
+  S::fetch_next(s.hops[hop].delay_ns[cycle]);
   const Times* layer = &s.layers[hop * s.clock[0].n_layers];
   for (i64 on = segment.layers; on != 0; on >>= 1, ++layer) {
-    if (on & 1) delay = later(delay, (*layer)[cycle]);
+    if ((on & 1) == 0) continue;
+    delay = later(delay, (*layer)[cycle]);
+    S::fetch_next((*layer)[cycle]);
   }
   return delay;
 }
 
-// Loses a message when its transmission begins, or would begin.
+// Loses a message at the begin of its transmission.
 template <class S>
 [[gnu::noinline]] void lose_message(S& s, i64 cell, i64 cycle, i64 flow, Outcome outcome, i64 at_ns,
                                     i64 now) {
@@ -86,7 +89,7 @@ void send(S& s, i64 cell, i64 cycle, i64 flow, i64 hop_row, i64 attempt, i64 now
   } else if (link.retransmit_ns < 0) {
     lose_message(s, cell, cycle, flow, kDropped, start, now);
   } else if (segment.is_down) {
-    // A link that holds messages back and is down for good: it waits for ever.
+    // The link holds messages back and is down for good: the message never arrives.
     lose_message(s, cell, cycle, flow, kInFlight, now, now);
     lose_behind(s, key);
   } else {
@@ -96,13 +99,13 @@ void send(S& s, i64 cell, i64 cycle, i64 flow, i64 hop_row, i64 attempt, i64 now
   }
 }
 
-// When the state of a task is sent next, -1 if never; and the number of that attempt.
+// Instant of the next attempt to send the state of a task, -1 for none, and the attempt's number.
 struct StateAttempt {
   i64 at_ns;
-  i64 number;  // waiting for the end of an outage is none
+  i64 number;  // a wait for the end of an outage does not count
 };
 
-// Sends the state of a task that moves, reliably, whatever the link does; posts its arrival.
+// Attempts to send the state of a task that moves, reliably on every link; posts its arrival.
 template <class S>
 StateAttempt send_state(S& s, i64 hop_row, i64 cycle, i64 attempt, i64 key, i64 now) {
   const Hop& hop = s.hops[hop_row];

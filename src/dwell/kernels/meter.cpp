@@ -1,5 +1,5 @@
-// The times of jobs and messages that the instants of a window's cycles show, by part: a task on a
-// node, or a flow on a link.
+// Times of jobs and messages from the instants of a window's cycles, by part: a task on a node, or
+// a flow on a link.
 
 #include <algorithm>
 #include <cmath>
@@ -10,9 +10,9 @@
 
 namespace dwell {
 
-// A message on a link: when it was sent, how long that takes, and its time so far.
+// A message on a link: its send instant, its transmission time, and its time so far.
 struct Crossing {
-  i64 link, sent_ns, number;  // of those that were found
+  i64 link, sent_ns, number;  // in the order in which messages are found
   i64 arrived_ns, repeats;
   f64 cost_ns;
   f64* ms;
@@ -25,7 +25,7 @@ struct Crossing {
 
 namespace {
 
-// Messages that waited for the same one are handed over within this time of each other.
+// Messages that waited for the same message arrive within this time of each other.
 constexpr i64 kTogetherNs = 100'000;
 
 void add(Found& found, i64 part, f64 ms) {
@@ -33,8 +33,8 @@ void add(Found& found, i64 part, f64 ms) {
   found.ms[part * found.most + found.count[part]++] = ms;
 }
 
-// Adds what lies between two instants. What has not come is lost if it began before the limit; if
-// it began later, or never, nothing is known of it. Returns whether it has come.
+// Adds the time between two instants, or infinity for a job or message that began before the limit
+// and has not ended; one that began later, or not at all, is unknown. Returns whether it has ended.
 bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
   if (begin_ns >= 0 && end_ns >= 0) {
     add(found, part, static_cast<f64>(end_ns - begin_ns) / 1e6);
@@ -46,7 +46,8 @@ bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
   return false;
 }
 
-// The delay of a message that waited for one before it: the last known one that may be its own.
+// The delay of a message that waited for an earlier message: the last earlier delay on the link
+// that is no larger than its own time.
 f64 last_delay_within(const Crossing* crossing, const Crossing* first) {
   for (const Crossing* other = crossing; other != first;) {
     --other;
@@ -56,7 +57,7 @@ f64 last_delay_within(const Crossing* crossing, const Crossing* first) {
   return *crossing->ms;
 }
 
-// Takes off the time that messages waited behind others of the cell, and that they were sent for.
+// Subtracts the transmission times of messages, and their waits for other messages of the cell.
 void take_off_waits(const Found& found) {
   std::sort(found.crossings, found.crossings + found.n_crossings);
   i64 link = -1, last_ns = 0;
@@ -70,7 +71,7 @@ void take_off_waits(const Found& found) {
     }
     link = crossing.link;
     free_ns = std::max(free_ns, sent_ns) + crossing.cost_ns;
-    // What arrived earlier than that went over a link that is better than is known.
+    // A message that arrived before `free_ns` used a link that is faster than known.
     *crossing.ms = std::max(*crossing.ms - (free_ns - sent_ns) / 1e6, 0.0);
     if (crossing.repeats == 0) continue;
     if (crossing.arrived_ns - kTogetherNs <= last_ns) {
@@ -80,7 +81,7 @@ void take_off_waits(const Found& found) {
   }
 }
 
-// Rounds to whole nanoseconds, as everything is measured: equal values must be ties.
+// Rounds to whole nanoseconds, the unit of all measurements, to make equal values ties.
 void round_all(const Found& found) {
   for (i64 i = 0; i < found.n_parts; ++i) {
     f64* ms = found.ms + found.order[i] * found.most;
@@ -88,7 +89,7 @@ void round_all(const Found& found) {
   }
 }
 
-// The next candidate that cycles under `active` were also sent through; -1 if there is none.
+// The next candidate of the shadows of cycles under `active`; -1 for none.
 i64 next_other(const Window& window, i64 shadow, i64 active, i64 after) {
   i64 next = -1;
   for (i64 i = 0; i < window.n; ++i) {
@@ -104,12 +105,12 @@ i64 next_other(const Window& window, i64 shadow, i64 active, i64 after) {
 
 using namespace dwell;
 
-// Adds the times, or demands, of the cycles under one candidate, part after part, then those of
+// Adds the times, or demands, of the cycles under one candidate, part after part, then the times of
 // their shadows by candidate.
 DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 active, i64 limit_ns,
                               Found* found) noexcept {
   const i64 n_tasks = layout->n_tasks, n_flows = layout->n_flows, n_parts = n_tasks + n_flows;
-  const i64 shadow = 1 + 4 * n_tasks + n_flows;  // where its columns begin
+  const i64 shadow = 1 + 4 * n_tasks + n_flows;  // its first column
   found->n_crossings = 0;
   i64 other = -1;
   do {
@@ -135,7 +136,7 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
           const i64 sent_ns = (shared[flow] ? cycle + 1 + n_tasks : end_ns)[source];
           const bool has_come = add_span(*found, part, sent_ns, arrived_ns[flow], limit_ns);
           if (found->cost == nullptr || found->link[part] < 0 || sent_ns < 0) continue;
-          // Of what is lost nobody knows whether it was sent.
+          // A lost message may never have occupied the link.
           if (!has_come) continue;
           f64* ms = found->ms + part * found->most + found->count[part] - 1;
           const i64 number = found->n_crossings++;

@@ -22,8 +22,8 @@ class CyclesLayout:
     sources : int64 array, shape (flows,)
         Source of each flow.
     parts : int64 array, shape (1 + candidates, tasks + flows)
-        Number of the part of each task, then of each flow, for the cycles themselves, then for
-        their shadows through each candidate; -1 where they have none of their own.
+        Number of the part of each task, then of each flow. Row 0 is for the cycles themselves, the
+        other rows for their shadows through each candidate; -1 for no own part.
     shared : bool array, shape (1 + candidates, flows)
         Whether the source of a flow is shared with the cycle.
     """
@@ -36,7 +36,7 @@ class CyclesLayout:
         self.row = structs()["Layout"](parts.shape[1] - flows, flows, *addresses)
 
     def __reduce__(self) -> tuple[type[CyclesLayout], tuple[NDArray[Any], ...]]:
-        # A copy has addresses of its own.
+        # A copy has its own addresses.
         return CyclesLayout, self._behind
 
 
@@ -51,13 +51,14 @@ class WindowRows:
         Number of tasks and flows.
     beside : int64 array, shape (n, 1 or 2, tasks, 2), optional
         Two integrals over the run of each job, of the cycles and then of their shadows. The first
-        is of the threads of all cells on its server, its own included. The second, for shadow
-        jobs, is of the threads of the own jobs of all cells. Only where cells share nodes.
+        integrates the threads of all cells on its server, its own included. The second, for shadow
+        jobs, integrates the threads of the own jobs of all cells. Only if cells share nodes.
     """
 
     def __init__(self, table: Ints, tasks: int, flows: int, beside: Ints | None = None) -> None:
         self.table, self.tasks, self.flows, self.beside = table, tasks, flows, beside
         self.row = structs()["Window"](table.ctypes.data, *table.shape)
+        self._known: tuple[int, int] | None = None
 
     @classmethod
     def of(
@@ -77,7 +78,7 @@ class WindowRows:
         columns = [cycles[0][:, None], *cycles[1:]]
         if shadows is not None:
             columns += [shadows[0][:, None], *shadows[1:]]
-        # One table has one address; to look up an address takes as long as a copy.
+        # One table needs one address; the look-up of an address takes as long as a copy.
         table = np.concatenate(columns, axis=1, dtype=np.int64)
         return cls(table, cycles[1].shape[1], cycles[3].shape[1])
 
@@ -107,12 +108,8 @@ class WindowRows:
         return bool(self.table.shape[1] > 1 + 4 * self.tasks + self.flows)
 
     def __reduce__(self) -> tuple[type[WindowRows], tuple[Ints, int, int, Ints | None]]:
-        # A copy has an address of its own.
+        # A copy has its own address.
         return WindowRows, (self.table, self.tasks, self.flows, self.beside)
-
-    def copy(self) -> WindowRows:
-        """Return a copy with its own table."""
-        return WindowRows(self.table.copy(), self.tasks, self.flows, self.beside)
 
     def unknown(self, limit_ns: int) -> tuple[bool, bool, bool]:
         """Return which kinds of unknown values the window has.
@@ -123,20 +120,33 @@ class WindowRows:
             Whether an own job that began before `limit_ns` is unfinished; whether the work of a
             completed own job is unknown; whether the work of a completed shadow job is unknown.
         """
-        found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
+        found = self._look(limit_ns)
         return bool(found & 1), bool(found & 2), bool(found & 4)
+
+    def candidates(self, limit_ns: int) -> list[int]:
+        """Return the candidates of the cycles, ascending; one call of the kernel per limit."""
+        if self._look(limit_ns) & 8:
+            return sorted(set(self.table[:, 0].tolist()))
+        return [self.table.item(0, 0)]
+
+    def _look(self, limit_ns: int) -> int:
+        known = self._known
+        if known is None or known[0] != limit_ns:
+            found = _unknown()(self.tasks, self.flows, byref(self.row), limit_ns)
+            known = self._known = limit_ns, found
+        return known[1]
 
 
 class PartTimes:
-    """Times, or demands, of the parts of a window's cycles, milliseconds, infinite where lost.
+    """Times, or demands, of the parts of a window's cycles, milliseconds; infinite if lost.
 
     Parameters
     ----------
     parts : int
         Number of parts.
     cost : float64 array, shape (parts,), optional
-        Where demands are asked for: of a job its time alone over its core time, of a message the
-        nanoseconds that its link takes to send it.
+        Given to measure demands instead of times: for a job the ratio of its time alone to its core
+        time, for a message its transmission time in nanoseconds.
     link : int64 array, shape (parts,), optional
         Number of the link of a message, if messages wait there; -1 for none.
     repeats : int64 array, shape (parts,), optional
@@ -145,7 +155,7 @@ class PartTimes:
     Raises
     ------
     KernelError
-        If the library cannot be loaded: before the first window, and not in it.
+        If the library cannot be loaded; raised before the first window.
     """
 
     def __init__(
@@ -158,7 +168,7 @@ class PartTimes:
         self._meter = _meter()
         self._cost, self._link, self._repeats = cost, link, repeats
         self._count, self._order = np.zeros((2, parts), np.int64)
-        #: The kernel's row of what has been found.
+        #: The kernel's row of the times found.
         self.found = structs()["Found"]()
         self.found.count, self.found.order = self._count.ctypes.data, self._order.ctypes.data
         if cost is not None and link is not None and repeats is not None:
@@ -169,11 +179,11 @@ class PartTimes:
     def __reduce__(
         self,
     ) -> tuple[type[PartTimes], tuple[int, Floats | None, Ints | None, Ints | None]]:
-        # As in a copy of `CyclesLayout`; what has been found stays here.
+        # A copy has its own addresses, and starts without times.
         return PartTimes, (len(self._count), self._cost, self._link, self._repeats)
 
     def begin(self, window: WindowRows, limit_ns: int) -> None:
-        """Begin a window; the times of the one before are overwritten.
+        """Begin a window; this overwrites the times of the previous window.
 
         Parameters
         ----------
@@ -186,7 +196,7 @@ class PartTimes:
             self._ms = np.empty((len(self._count), 2 * count))
             self.found.ms, self.found.most = self._ms.ctypes.data, self._ms.shape[1]
         if self._cost is not None:
-            # Of every cycle and its shadow the messages, seven numbers each (`Crossing`).
+            # Messages of every cycle and its shadow; a `Crossing` has seven numbers.
             room = 2 * count * flows * 7
             if len(self._crossings) < room:
                 self._crossings = np.empty(room, np.int64)
@@ -195,15 +205,23 @@ class PartTimes:
         self.found.n_parts = 0
 
     def add(self, active: int, layout: CyclesLayout) -> None:
-        """Add what the cycles under one candidate show, and then their shadows."""
+        """Add the times of the cycles under one candidate, then the times of their shadows."""
         row = byref(self._window.row)
         self._meter(byref(layout.row), row, active, self._limit_ns, byref(self.found))
 
+    @property
+    def numbers(self) -> list[int]:
+        """Numbers of the parts, in the order in which they were found."""
+        numbers: list[int] = self._order[: self.found.n_parts].tolist()
+        return numbers
+
+    def values(self, part: int) -> Floats:
+        """Return the times of a part."""
+        return self._ms[part, : self._count[part]]
+
     def by_part(self) -> dict[int, Floats]:
         """Return the times by number of part, in the order in which they were found."""
-        counts = self._count.tolist()
-        order = self._order[: self.found.n_parts].tolist()
-        return {part: self._ms[part, : counts[part]] for part in order}
+        return {part: self.values(part) for part in self.numbers}
 
 
 _unknown = foreign("dwell_unknown", c_int64, c_int64, c_int64, c_void_p, c_int64)

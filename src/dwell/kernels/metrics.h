@@ -1,4 +1,4 @@
-// The metrics of a window as it could be known when it closed: misses, L95, shares of resources.
+// Metrics of a window as known at its end: misses, L95, shares of resources.
 #pragma once
 
 #include <limits>
@@ -10,8 +10,8 @@ namespace dwell {
 // Rank of L95 among n values: ceil(0.95 n).
 constexpr i64 l95_rank(i64 n) { return (19 * n + 19) / 20; }
 
-// Whether a value at a rank, of ages among latencies, is that of a cycle that has not completed: of
-// equal values those come last.
+// Whether the value at the rank of L95 is the age of an unfinished cycle; between equal values,
+// latencies precede ages.
 template <class S>
 bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 value, i64 now) {
   const Cell& of = s.cell(cell);
@@ -25,7 +25,7 @@ bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 value, i64 now) {
   return before < l95_rank(n);
 }
 
-// What `n` cycles show now.
+// Metrics of `n` cycles as known now.
 template <class S>
 [[gnu::noinline]] Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
   const Cell& of = s.cell(cell);
@@ -47,7 +47,7 @@ template <class S>
               lost ? std::numeric_limits<f64>::infinity() : l95_ms};
 }
 
-// Writes the share of each resource that was used from the release of a cycle until now.
+// Writes the used share of each resource from the release of a cycle until now.
 template <class S>
 void measure_shares(const S& s, i64 cell, const f64* opened, const f64* closed, i64 first, i64 now,
                     f64* shares) {
@@ -62,7 +62,7 @@ void measure_shares(const S& s, i64 cell, const f64* opened, const f64* closed, 
   }
 }
 
-// Closes a window; the next one follows without a gap unless the caller says otherwise.
+// Ends a window; the next window follows without a gap unless the caller changes it.
 template <class S>
 [[gnu::noinline]] void close_window(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);
@@ -77,7 +77,7 @@ template <class S>
   of.close_cycle += of.window_cycles;
 }
 
-// Looks at the cycles that a decision is about: the last W under the placement in force, or fewer.
+// Measures the cycles for a decision: the last W under the placement in force, or fewer.
 template <class S>
 [[gnu::noinline]] void look(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);

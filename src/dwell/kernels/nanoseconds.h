@@ -7,7 +7,7 @@
 namespace dwell {
 
 constexpr double kNsPerMs = 1e6;
-// No duration of a realisation is longer (dwell.model.instants.HORIZON_NS).
+// Longest duration in a realisation (dwell.model.instants.HORIZON_NS).
 constexpr double kHorizonNs = 9.2e18;
 
 // Rounds half to even; from 0 to 2^63.

@@ -1,4 +1,4 @@
-// Draws an alternating renewal process: off for a time, then on for a time, and so on.
+// Samples an alternating renewal process: off for a time, then on for a time, and so on.
 
 #include <algorithm>
 #include <cstdint>
@@ -6,8 +6,8 @@
 #include "export.h"
 #include "nanoseconds.h"
 
-// Adds up times off and times on, which are in a unit of `unit_ns`, from `elapsed_ns` after
-// `since_ns` on; returns the number of intervals that begin before the horizon.
+// Adds up times off and times on, both in units of `unit_ns`, starting `elapsed_ns` after
+// `since_ns`; returns the number of intervals that begin before the horizon.
 DWELL_EXPORT int64_t dwell_alternate(const double* off, const double* on, int64_t count,
                                      double unit_ns, double since_ns, double* elapsed_ns,
                                      double horizon_ns, int64_t* begin_ns,
@@ -18,7 +18,7 @@ DWELL_EXPORT int64_t dwell_alternate(const double* off, const double* on, int64_
     const double ended = end;
     *elapsed_ns += off[i] * unit_ns + length;
     end = since_ns + *elapsed_ns;
-    // The difference may be an instant that rounding moved before the end of the interval ahead.
+    // Rounding may move the difference before the end of the previous interval.
     const double begin = std::max(end - length, ended);
     if (begin >= horizon_ns) return i;
     begin_ns[i] = dwell::round_ns(begin);

@@ -1,6 +1,6 @@
 #pragma once
 
-// Times at which a disturbance is on, and how strongly.
+// Times and strengths of a disturbance.
 
 #include <limits>
 
@@ -18,7 +18,7 @@ inline i64 next_ns(const OnOffIntervals& intervals) noexcept {
   return (is_on(intervals) ? intervals.end_ns : intervals.begin_ns)[passed / 2];
 }
 
-// That of the interval that is on, or comes next.
+// Level of the present interval, or of the next if the disturbance is off.
 inline i64 level(const OnOffIntervals& intervals) noexcept {
   return intervals.levels[intervals.passed / 2];
 }

@@ -1,8 +1,7 @@
-// The order of links with `in_order`: no message arrives before one whose first attempt began
-// before its own.
+// The order of links with `in_order`: messages arrive in the order of their first attempts.
 //
-// The end of a repeat is not known beforehand. The messages behind one that is being repeated are
-// *held*, in the order of first attempts: the first held message of a link is always repeated.
+// The end of a repeat is unknown beforehand. Messages behind a repeated message are *held*, in the
+// order of first attempts; the first held message of a link is always being repeated.
 #pragma once
 
 #include "simulation.h"
@@ -12,7 +11,7 @@ namespace dwell {
 // The arrival of a held message that is being repeated.
 constexpr i64 kUnknown = -1;
 
-// Marks a cycle as one that can never be done; its first loss names the outcome.
+// Marks a cycle that can no longer complete; its first loss determines the outcome.
 template <class S>
 void lose(S& s, i64 cell, i64 cycle, Outcome outcome) {
   Slot& slot = s.slot(cell, cycle);
@@ -21,7 +20,7 @@ void lose(S& s, i64 cell, i64 cycle, Outcome outcome) {
   s.outcome[s.output(cell, cycle)] = outcome;
 }
 
-// Whether a cycle is that of a shadow that has been given up.
+// Whether a cycle belongs to a shadow that has been given up.
 template <class S>
 bool is_given_up(const S& s, i64 cell, i64 cycle) {
   if (S::kPlain || s.cell(cell).parent < 0) return false;
@@ -29,7 +28,7 @@ bool is_given_up(const S& s, i64 cell, i64 cycle) {
   return cycle + parent.given_up_after < parent.released;
 }
 
-// Adds a message behind all that are held; `key` is the event of its arrival.
+// Adds a message behind all held messages; `key` is the event of its arrival.
 template <class S>
 void hold(S& s, i64 link, i64 key, i64 arrival_ns) {
   s.held[s.clock[0].n_held++] = Held{key, link, arrival_ns};
@@ -44,7 +43,7 @@ i64 find_held(const S& s, i64 key) {
   return row;
 }
 
-// Posts the arrivals of a link's held messages, up to the first that is being repeated.
+// Posts the arrivals of a link's held messages, up to the first message that is being repeated.
 template <class S>
 void release_held(S& s, i64 link_row) {
   Link& link = s.links[link_row];
@@ -66,7 +65,7 @@ void release_held(S& s, i64 link_row) {
   s.clock[0].n_held = kept;
 }
 
-// Ends the repeats of a held message: it arrives, or others need not wait for it, from then on.
+// Ends the repeats of a held message at `arrival_ns`: it arrives, or other messages stop waiting.
 template <class S>
 [[gnu::noinline]] void end_repeats(S& s, i64 key, i64 arrival_ns) {
   const i64 row = find_held(s, key);
@@ -91,7 +90,7 @@ void post_arrival(S& s, i64 link_row, i64 key, i64 arrival_ns, bool is_repeated)
   }
 }
 
-// Loses what is held behind a message that will never arrive.
+// Loses the messages held behind a message that will never arrive.
 template <class S>
 [[gnu::noinline]] void lose_behind(S& s, i64 key) {
   const i64 n_held = s.clock[0].n_held, first = find_held(s, key);

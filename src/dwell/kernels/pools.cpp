@@ -1,4 +1,4 @@
-// Pools: what is held of each part of a cycle, next to what it is as declared (pool.py).
+// Pools: the measured and the declared values of each part of a cycle (pool.py).
 
 #include <algorithm>
 #include <cmath>
@@ -10,7 +10,7 @@
 
 namespace dwell {
 
-// How values lie among known ones: sums of -log(1 - p), of -log(p), and of p, their places.
+// Places p of values among known values: the sums of -log(1 - p), of -log(p), and of p.
 struct PlaceSums {
   i64 size;
   f64 larger, smaller, places;
@@ -21,14 +21,16 @@ namespace {
 // As in pool.py.
 constexpr i64 kLargest = 200, kEnough = 12;
 constexpr f64 kMoved = 0.75, kShifted = 4.0, kAlike = 2.0;
-// Room for values and for chunks, of which the newest are held (pools.py).
+// Room for the newest values, and for their chunks (pools.py).
 constexpr i64 kRoom = 408;
-// Why a pool needs another look: what a window brought has not been added, or it has been.
-// The third: it has been added to a pool that is not as declared.
+// Parts of the range of declared values (pools.py).
+constexpr i64 kGuideParts = 512;
+// Why Python must look at a pool: the values of the window were not added; they were added; they
+// were added to a pool that is not as declared.
 constexpr i64 kNotAdded = 1, kAdded = 2, kGrown = 3;
 
-// The first of ascending values that is not below another one. Which half comes next is computed
-// and not branched on: it cannot be foreseen.
+// The first of ascending values that is at least `value`. The next half is computed without a
+// branch, because branch prediction fails here.
 const f64* first_not_below(const f64* known, i64 n, f64 value) {
   if (n == 0) return known;
   while (n > 1) {
@@ -39,15 +41,29 @@ const f64* first_not_below(const f64* known, i64 n, f64 value) {
   return known + (*known < value ? 1 : 0);
 }
 
+// Returns the part of the declared range that contains a value, or the nearest end.
+i64 part_of(f64 value, f64 low, f64 parts_per_ms) {
+  const f64 place = (value - low) * parts_per_ms;
+  if (place >= static_cast<f64>(kGuideParts)) return kGuideParts - 1;
+  return place > 0.0 ? static_cast<i64>(place) : 0;
+}
+
+// Returns the first declared value that is at least `value`, searching only the value's part.
+const f64* first_declared_not_below(const Pool& pool, f64 value) {
+  const i32* part = pool.guide + part_of(value, pool.guide_low, pool.guide_parts_per_ms);
+  return first_not_below(pool.known + part[0], part[1] - part[0], value);
+}
+
+template <class Search>
 void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
-                PlaceSums& out) {
-  // Of so many places the product is far from the least number, and has one logarithm.
+                PlaceSums& out, Search search) {
+  // Multiply this many places before one logarithm; their product cannot underflow.
   constexpr i64 kTogether = 16;
   out = {n, 0.0, 0.0, 0.0};
   f64 beyond = 1.0, below = 1.0;
   for (i64 i = 0; i < n; ++i) {
     const f64 value = values[i] > patience_ms ? std::numeric_limits<f64>::infinity() : values[i];
-    const f64* first = first_not_below(known, n_known, value);
+    const f64* first = search(value);
     const f64* last = first;
     if (first != known + n_known && *first == value) {
       last = std::upper_bound(first, known + n_known, value);
@@ -65,20 +81,31 @@ void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 pat
   }
 }
 
+void add_places(const f64* known, i64 n_known, const f64* values, i64 n, f64 patience_ms,
+                PlaceSums& out) {
+  add_places(known, n_known, values, n, patience_ms, out,
+             [&](f64 value) { return first_not_below(known, n_known, value); });
+}
+
+void add_declared_places(const Pool& pool, const f64* values, i64 n, PlaceSums& out) {
+  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, out,
+             [&](f64 value) { return first_declared_not_below(pool, value); });
+}
+
 PlaceSums plus(const PlaceSums& one, const PlaceSums& other, i64 sign) {
   const f64 by = static_cast<f64>(sign);
   return {one.size + sign * other.size, one.larger + by * other.larger,
           one.smaller + by * other.smaller, one.places + by * other.places};
 }
 
-// Deviations from chance by which values of a stretch of so many cycles are larger, or smaller,
-// than declared.
+// Deviations from chance by which values are larger, or smaller, than declared; the values are from
+// a stretch of `cycles` cycles.
 f64 deviations(const Pool& pool, const PlaceSums& sums, i64 cycles) {
   if (sums.size == 0) return 0.0;
   const f64 size = static_cast<f64>(sums.size);
   const f64 share = static_cast<f64>(pool.block) / static_cast<f64>(cycles);
   const f64 together = size * std::min(share, 1.0);
-  // Of a sum of exponential values, by the cube root of its mean (Wilson and Hilferty).
+  // Wilson and Hilferty: the cube root of the mean of exponential values is almost normal.
   const f64 part = 1.0 / (9.0 * size);
   const f64 largest = std::max({sums.larger, sums.smaller, 0.0}) / size;
   const f64 off = (dwell::cube_root(largest) - (1.0 - part)) / std::sqrt(part);
@@ -90,7 +117,7 @@ bool is_large(const PlaceSums& sums) {
   return !(1 - kMoved <= mean && mean <= kMoved);
 }
 
-// Keeps what is held at the begin of its room, where no more fits behind it.
+// Moves the held rows to the begin of their room, if `more` rows do not fit behind them.
 template <class Row>
 void make_room(Row* rows, i64& first, i64 n, i64 more) {
   if (first + n + more <= kRoom) return;
@@ -98,7 +125,7 @@ void make_room(Row* rows, i64& first, i64 n, i64 more) {
   first = 0;
 }
 
-// Adds values, and drops the oldest: what is forgotten, and what is beyond `kLargest`.
+// Adds values, and drops the oldest windows: those beyond the memory, or to keep `kLargest` values.
 void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 memory,
          i64 cycles) {
   make_room(pool.chunks, pool.first_chunk, pool.n_chunks, 1);
@@ -117,7 +144,7 @@ void add(Pool& pool, const f64* values, const PlaceSums& shift, i64 window, f64 
     ++pool.first_chunk;
     --pool.n_chunks;
   }
-  // What is left of what was held, then the new values.
+  // The remaining old values, then the new values.
   const i64 kept = total.size - shift.size;
   pool.first += pool.size - kept;
   make_room(pool.held, pool.first, kept, shift.size);
@@ -143,17 +170,17 @@ PlaceSums run_of(const Pool& pool) {
   return {pool.run_size, pool.run_larger, pool.run_smaller, pool.run_places};
 }
 
-// Whether windows that are larger, or smaller, are a run with those before: up to a stretch.
+// Whether a window continues the run of larger, or smaller, windows; a run is at most a stretch.
 bool run_goes_on(const Pool& pool, i64 cycles) {
   return pool.run_cycles > 0 && pool.run_cycles + cycles <= pool.block;
 }
 
-// Adds what a window brought to a pool that is not as declared, if it is neither near what is
-// declared, nor of another regime.
+// Adds the values of a window to a pool that is not as declared, unless they resemble the declared
+// values, or show another regime.
 i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles) {
   if (pool.doubts != 0 || pool.size > kLargest) return kNotAdded;
   PlaceSums declared, run;
-  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  add_declared_places(pool, values, n, declared);
   if (deviations(pool, declared, cycles) < kAlike) return kNotAdded;
   const bool goes_on = run_goes_on(pool, cycles);
   if (!goes_on) {
@@ -175,13 +202,13 @@ i64 learn_otherwise(Pool& pool, const f64* values, i64 n, i64 window, f64 memory
   return kGrown;
 }
 
-// Adds what a window brought to a pool that is as declared, if that is nothing to look at; returns
-// 0 then, else why another look is needed.
+// Adds the values of a window to a pool, unless they show another regime; returns 0, or the reason
+// why Python must look at the pool.
 i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycles, f64 least) {
   if (pool.n_known == 0 || pool.asks != 0 || n > kLargest) return kNotAdded;
   if (pool.is_declared == 0) return learn_otherwise(pool, values, n, window, memory, cycles);
   PlaceSums declared;
-  add_places(pool.known, pool.n_known, values, n, pool.patience_ms, declared);
+  add_declared_places(pool, values, n, declared);
   const bool goes_on = run_goes_on(pool, cycles);
   const PlaceSums run = goes_on ? plus(run_of(pool), declared, 1) : declared;
   const i64 run_cycles = cycles + (goes_on ? pool.run_cycles : 0);
@@ -201,8 +228,8 @@ i64 learn(Pool& pool, const f64* values, i64 n, i64 window, f64 memory, i64 cycl
 
 using namespace dwell;
 
-// Adds up where values lie among `n_known` ascending ones into `out`; a value beyond the patience
-// counts as lost.
+// Writes the sums of the places of values among `n_known` ascending values; a value beyond the
+// patience counts as lost.
 DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values, i64 n,
                                f64 patience_ms, f64* out) noexcept {
   PlaceSums sums;
@@ -212,8 +239,8 @@ DWELL_EXPORT void dwell_places(const f64* known, i64 n_known, const f64* values,
   out[2] = sums.places;
 }
 
-// Adds what a window brought of some parts to their pools; writes of each part why Python has to
-// look at it, 0 where it need not, and returns how many it has to look at.
+// Adds the values of a window to the pools of some parts. Writes for each part why Python must look
+// at the pool, or 0; returns the number of these pools.
 DWELL_EXPORT i64 dwell_learn(Pool* const* pools, const Found* found, const i64* parts, i64 n_parts,
                              i64 window, f64 memory, i64 cycles, f64 least, i64* out) noexcept {
   i64 n = 0;
@@ -226,12 +253,22 @@ DWELL_EXPORT i64 dwell_learn(Pool* const* pools, const Found* found, const i64* 
   return n;
 }
 
+// Writes the number of declared values below each part of their range, and below its end.
+DWELL_EXPORT void dwell_guide(const f64* known, i64 n_known, f64 low, f64 parts_per_ms,
+                              i32* out) noexcept {
+  i64 part = 0;
+  for (i64 i = 0; i < n_known; ++i) {
+    for (; part <= part_of(known[i], low, parts_per_ms); ++part) out[part] = static_cast<i32>(i);
+  }
+  for (; part <= kGuideParts; ++part) out[part] = static_cast<i32>(n_known);
+}
+
 DWELL_EXPORT void dwell_pool_add(Pool* pool, const f64* values, i64 n, f64 larger, f64 smaller,
                                  f64 places, i64 window, f64 memory, i64 cycles) noexcept {
   add(*pool, values, {n, larger, smaller, places}, window, memory, cycles);
 }
 
-// Writes the numbers of the pools that are not as declared, and returns how many they are.
+// Writes the numbers of the pools that are not as declared; returns their count.
 DWELL_EXPORT i64 dwell_others(const Pool* const* pools, i64 n_pools, i64* out) noexcept {
   i64 n = 0;
   for (i64 i = 0; i < n_pools; ++i) {
@@ -240,8 +277,8 @@ DWELL_EXPORT i64 dwell_others(const Pool* const* pools, i64 n_pools, i64* out) n
   return n;
 }
 
-// Writes of each row of parts, -1 for none, the fewest measured values of one, and the window that
-// the oldest of their newest values is from.
+// Writes for each row of parts, -1 for none, the fewest measured values of a part, and the earliest
+// window of a part's newest values.
 DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 n_rows, i64 width,
                                 i64* out) noexcept {
   for (i64 row = 0; row < n_rows; ++row, out += 2) {
@@ -255,13 +292,13 @@ DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 
   }
 }
 
-// Writes the times of cycles, nanoseconds: those of `values` that are finite, in turn, as from the
-// cycle `first` on. Returns how many these are.
+// Writes the times of cycles from `first` on, nanoseconds: the finite values, repeated in turn from
+// cycle 0. Returns the number of finite values.
 DWELL_EXPORT i64 dwell_fill(const f64* values, i64 n, f64 stretched, i64 first, i64 count,
                             i64* out) noexcept {
   const i64 known = std::count_if(values, values + n, [](f64 ms) { return std::isfinite(ms); });
   if (known == 0) return 0;
-  // From each known value the cycle that it is first met in.
+  // First row of each known value.
   i64 at = (known - first % known) % known;
   for (i64 i = 0; i < n; ++i) {
     if (!std::isfinite(values[i])) continue;

@@ -1,11 +1,11 @@
-"""What is held of the parts of a cycle (see ``pools.cpp``)."""
+"""Pools of the newest values of each part of a cycle (see ``pools.cpp``)."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from ctypes import addressof, byref, c_double, c_int64, c_void_p
-from typing import Any
+from ctypes import addressof, byref, c_double, c_int32, c_int64, c_void_p
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,8 +16,12 @@ from dwell.model.number_arrays import Floats, Ints
 
 #: Room for values, and for windows.
 ROOM = 408
-#: What `PoolRows.learn` did with the values of a part where Python has to look at the pool: it left
-#: them out; it added them; it added them to a pool that is not as declared and has not changed.
+#: Bytes of an instant.
+BYTES = 8
+#: Number of equal parts of the range of the declared values; the kernel searches in one of them.
+GUIDE_PARTS = 512
+#: Why Python must look at a pool after `PoolRows.learn`: the values were not added; they were
+#: added; they were added to a pool that is not as declared, and show the same regime.
 NOT_ADDED, ADDED, GROWN = 1, 2, 3
 
 
@@ -42,15 +46,20 @@ class HeldValues:
         self._known, self._held = known, np.empty(ROOM)
         self._before, self._values = np.empty(ROOM), (-1, np.empty(0))
         self._chunks = (structs()["Chunk"] * ROOM)()
+        finite = known[np.isfinite(known)]
+        low, high = (finite[0].item(), finite[-1].item()) if len(finite) else (0.0, 0.0)
+        self.row.guide_low = low
+        self.row.guide_parts_per_ms = GUIDE_PARTS / (high - low) if high > low else 0.0
+        self._scratch = (c_double * 0)()
         self._set_addresses()
 
     def __getstate__(self) -> tuple[Any, ...]:
         return bytes(self.row), self._known, self._held, self._before, bytes(self._chunks)
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
-        # A copy has addresses of its own.
+        # A copy has its own addresses.
         row, self._known, self._held, self._before, chunks = state
-        self._values = -1, np.empty(0)
+        self._values, self._scratch = (-1, np.empty(0)), (c_double * 0)()
         self.row = structs()["Pool"].from_buffer_copy(row)
         self._chunks = (structs()["Chunk"] * ROOM).from_buffer_copy(chunks)
         self._set_addresses()
@@ -58,10 +67,14 @@ class HeldValues:
     def _set_addresses(self) -> None:
         self.row.known, self.row.held = self._known.ctypes.data, self._held.ctypes.data
         self.row.before, self.row.chunks = self._before.ctypes.data, addressof(self._chunks)
+        self._guide = (c_int32 * (GUIDE_PARTS + 1))()
+        self.row.guide = addressof(self._guide)
+        where = self.row.guide_low, self.row.guide_parts_per_ms, self._guide
+        _guide()(self.row.known, len(self._known), *where)
 
     @property
     def values(self) -> Floats:
-        """The values in the order in which they came: the same array until they change."""
+        """The values in the order of arrival; the same array until they change."""
         row, (changes, values) = self.row, self._values
         if changes != row.changes:
             values = self._held[row.first : row.first + row.size].copy()
@@ -71,7 +84,7 @@ class HeldValues:
 
     @property
     def before(self) -> Floats:
-        """The values, ascending, before the run of windows that is going on; see `Pool`."""
+        """The values, ascending, before the present run of windows (see ``rows.h``)."""
         return self._before[: self.row.n_before].copy() if self.row.n_before else self._known
 
     @before.setter
@@ -82,8 +95,20 @@ class HeldValues:
         self.row.n_before = 0 if values is self._known else len(values)
         self._before[: self.row.n_before] = values[: self.row.n_before]
 
+    def error(self) -> tuple[float, float]:
+        """Return the lost share of the values, and the standard error of their 95th percentile.
+
+        The error is no less than the error of the mean. Infinite values are lost; of the others,
+        at least two must be known for an error above 0.
+        """
+        if len(self._scratch) < self.row.size:
+            self._scratch = (c_double * len(self._held))()
+        out = (c_double * 2)()
+        _held_error()(byref(self.row), self._scratch, out)
+        return out[0], out[1]
+
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
-        """Hold some values, none of which was measured, in the place of all others."""
+        """Replace all values by values that were not measured."""
         row = self.row
         if len(values) > len(self._held):
             self._held = np.empty(len(values))
@@ -103,12 +128,12 @@ class HeldValues:
         memory: float,
         cycles: int,
     ) -> None:
-        """Add values, and drop the oldest: what is forgotten, and what is beyond the most held.
+        """Add values, and drop the oldest: values beyond the memory or the largest number held.
 
         Parameters
         ----------
         sums : tuple of float
-            Of their places (see `places`).
+            Sums of the values' places (see `places`).
         """
         values = np.ascontiguousarray(values)
         where = values.ctypes.data, len(values)
@@ -132,7 +157,7 @@ class PoolRows:
         self._of_groups = groups.ctypes.data, *groups.shape, self._support.ctypes.data
 
     def __reduce__(self) -> tuple[type[PoolRows], tuple[Sequence[HeldValues], Ints]]:
-        # A copy is of the copies of pools.
+        # A copy refers to the copies of the pools.
         return PoolRows, (self._pools, self._groups)
 
     def others(self) -> list[int]:
@@ -142,37 +167,52 @@ class PoolRows:
         return self._out[:n].tolist() if n else []
 
     def weakest(self) -> list[list[int]]:
-        """Return of each group the fewest measured values of a part, and the oldest window."""
+        """Return for each group the fewest measured values of a part, and the earliest window.
+
+        The window is the earliest one of the newest values of each part.
+        """
         _weakest()(self._addresses[0], *self._of_groups)
         return self._support.tolist()
 
     def learn(
-        self, found: PartTimes, parts: Ints, window: int, memory: float, cycles: int, least: float
-    ) -> list[int]:
-        """Add what a window brought to the pools that stay as they are, declared or not.
+        self,
+        found: PartTimes,
+        window: int,
+        memory: float,
+        cycles: int,
+        least: float,
+        parts: Ints | None = None,
+    ) -> list[tuple[int, int]]:
+        """Add the values of a window to the pools whose regime stays the same.
 
         Parameters
         ----------
-        parts : int64 array, shape (n,)
-            Numbers of the parts.
         least : float
-            Deviations that are another regime.
+            Fewest deviations from chance that show another regime.
+        parts : int64 array, shape (n,), optional
+            Numbers of the parts; if None, all parts that were found.
 
         Returns
         -------
-        list of int
-            Of each part, why another look is needed (`NOT_ADDED`, `ADDED`, `GROWN`), else 0.
+        list of tuple of (number, why)
+            Parts that need another look, and why (`NOT_ADDED`, `ADDED`, `GROWN`).
         """
-        pools, why = self._addresses
-        asked = parts.ctypes.data, len(parts), window, memory, cycles, least
-        n = _learn()(pools, byref(found.found), *asked, why)
-        return self._out[: len(parts)].tolist() if n else []
+        pools, out = self._addresses
+        of, count = found.found.order, found.found.n_parts
+        if parts is not None:
+            of, count = parts.ctypes.data, len(parts)
+        n = _learn()(pools, byref(found.found), of, count, window, memory, cycles, least, out)
+        if not n:
+            return []
+        numbers = found.numbers if parts is None else parts.tolist()
+        why = zip(numbers, self._out[:count].tolist(), strict=True)
+        return [(number, one) for number, one in why if one]
 
 
 def places(
     known: Floats, values: Floats, patience_ms: float = math.inf
 ) -> tuple[float, float, float]:
-    """Add up where values lie among known ones, each at a place p between 0 and 1.
+    """Add up the places p of values among known values; places are between 0 and 1.
 
     Parameters
     ----------
@@ -193,25 +233,38 @@ def places(
     return out[0], out[1], out[2]
 
 
-def fill(rows: Sequence[Ints], values: Floats, stretched: float, begin: int, offset: int) -> None:
-    """Let cycles meet known values in turn (see `dwell.estimators.presents`).
+class TimesRow(NamedTuple):
+    """The times of cycles: an int64 array, as an argument of `fill`."""
+
+    address: int
+    cycles: int
+
+    @classmethod
+    def of(cls, row: Ints) -> TimesRow:
+        """Return the row of a contiguous array, for as long as the array exists."""
+        return cls(row.ctypes.data, len(row))
+
+
+def fill(
+    rows: Sequence[TimesRow], values: Floats, stretched: float, begin: int, offset: int
+) -> None:
+    """Fill the times of cycles with known values in turn (see `dwell.estimators.presents`).
 
     Parameters
     ----------
-    rows : sequence of int64 array, shape (cycles,)
-        Nanoseconds; as they were if all values are lost.
+    rows : sequence of TimesRow
+        Nanoseconds; unchanged if all values are lost.
     values : float64 array
-        Milliseconds; what is infinite is left out.
+        Milliseconds; infinite values are left out.
     stretched : float
-        What the values are divided by.
+        Divisor of the values.
     begin, offset : int
-        First cycle that is filled, and which cycle the first of a row stands for.
+        First column that is filled, and the cycle of column 0.
     """
     values = np.ascontiguousarray(values)
     where = values.ctypes.data, len(values), stretched, begin + offset
-    for row in rows:
-        later = row[begin:]
-        _fill()(*where, len(later), later.ctypes.data)
+    for address, cycles in rows:
+        _fill()(*where, cycles - begin, address + begin * BYTES)
 
 
 _places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
@@ -221,6 +274,8 @@ _pool_add = foreign(
     None,
     *(c_void_p, c_void_p, c_int64, c_double, c_double, c_double, c_int64, c_double, c_int64),
 )
+_held_error = foreign("dwell_held_error", None, c_void_p, c_void_p, c_void_p)
+_guide = foreign("dwell_guide", None, c_void_p, c_int64, c_double, c_double, c_void_p)
 _learn = foreign(
     "dwell_learn",
     c_int64,

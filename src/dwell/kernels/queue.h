@@ -1,8 +1,8 @@
 // The queue of events, by (time, key): sorted while it is short, a calendar beyond.
 //
-// A calendar has a sorted list of the events of each day; days that lie a year apart share one.
-// With about one event a day, adding one and taking the first take no longer the more there are (R.
-// Brown, 1988, DOI 10.1145/63039.63045).
+// A calendar has a sorted list of events for each day; days a year apart share a list. With about
+// one event per day, the time to add an event or to take the first does not grow with their number
+// (R. Brown, 1988, DOI 10.1145/63039.63045).
 #pragma once
 
 #include <algorithm>
@@ -42,14 +42,14 @@ class Queue {
   bool has_room(i64 more) const { return size_ + more <= room_; }
   const Event& first() const { return events_[is_calendar_ ? first_ : size_ - 1]; }
 
-  // The caller has made sure of room.
+  // The caller ensures room.
   void push(i64 at_ns, i64 key) {
     const Event event{at_ns, key};
     if (!is_calendar_ && size_ >= kLongest) open_calendar();
     if (is_calendar_) {
       enter(event);
     } else {
-      // The first is last, so that what comes soon moves few.
+      // The first event is last: an event that is due soon moves few others.
       i64 i = size_;
       for (; i > 0 && events_[i - 1] < event; --i) events_[i] = events_[i - 1];
       events_[i] = event;
@@ -69,8 +69,8 @@ class Queue {
   i64 day_of(i64 row) const { return events_[row].at_ns >> day_bits_; }
   i32& list_of(i64 day) const { return days_[day & (n_days_ - 1)]; }
 
-  // Enters the row of an event into the list of its day, behind any that are its equals: the first
-  // event stays the first of its list.
+  // Enters the row of an event into the list of its day, behind equal events: the first event stays
+  // the first of its list.
   void link(i64 row) {
     i32* at = &list_of(day_of(row));
     while (*at != kNone && !(events_[row] < events_[*at])) at = &following_[*at];
@@ -78,7 +78,7 @@ class Queue {
     *at = static_cast<i32>(row);
   }
 
-  // Enters an event into the calendar, in a row that is free again or was never used.
+  // Enters an event into the calendar, in a freed or unused row.
   void enter(const Event& event) {
     i64 row = free_;
     if (row == kNone) {
@@ -91,7 +91,7 @@ class Queue {
     if (event < events_[first_]) first_ = row;
   }
 
-  // Strikes the first event off the calendar, and finds the next.
+  // Removes the first event from the calendar, and finds the next.
   void strike() {
     const i64 day = day_of(first_);
     list_of(day) = following_[first_];
@@ -104,13 +104,13 @@ class Queue {
     }
   }
 
-  // Finds the first event; none is before a day.
+  // Finds the first event, from a day on.
   void find_first(i64 day) {
     for (const i64 end = day + n_days_; day < end; ++day) {
       first_ = list_of(day);
       if (first_ != kNone && day_of(first_) == day) return;
     }
-    // None within a year: the first of all lists.
+    // No event within a year: take the first of all lists.
     first_ = kNone;
     for (const i32* list = days_; list < days_ + n_days_; ++list) {
       if (*list != kNone && (first_ == kNone || events_[*list] < events_[first_])) first_ = *list;
@@ -142,7 +142,7 @@ class Queue {
   bool is_calendar_;
   i32 *following_, *days_;
   i64 n_days_, day_bits_;
-  i64 first_, used_, free_;  // rows; those that were used and are free again are a list
+  i64 first_, used_, free_;  // rows; `free_` starts the list of freed rows
 };
 
 }  // namespace dwell

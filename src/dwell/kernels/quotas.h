@@ -1,4 +1,4 @@
-// Quotas of servers: when they are used up and renewed.
+// Quotas of servers: the instants at which they are used up and renewed.
 #pragma once
 
 #include <cmath>
@@ -15,7 +15,7 @@ void strike(S& s, Server& server, Quota& quota, i64 now);
 template <class S>
 i64 next_look(S& s, Server& server, Quota& quota, i64 now);
 
-// Whether a quota fills a pool, on which is drawn.
+// Whether a quota fills a pool, from which the server draws.
 template <class S>
 bool is_pooled(const S& s, const Server& server, const Quota& quota) {
   return quota.slack_ns > 0 || takes_turns(s, server);
@@ -31,9 +31,9 @@ void renew(S& s, Server& server, Quota& quota, i64 now) {
   filled = server.stress > 0 ? quota.stressed_ns : quota.quota_ns;
 }
 
-// Begins the periods that have begun before a server's foreign threads change.
+// Renews a server's quota for past periods, before the server's foreign threads change.
 //
-// Without a pool, what happens at the instant at which a period begins comes before it.
+// Without a pool, events at the first instant of a period precede the period.
 template <class S>
 void renew_before_stress(S& s, Server& server, i64 now) {
   if (!has_quota(s, server)) return;
@@ -43,16 +43,16 @@ void renew_before_stress(S& s, Server& server, i64 now) {
     return;
   }
   renew(s, server, quota, now - 1);
-  // One that a job of this instant has begun already begins anew, with nothing used of it.
+  // If a job of this instant has already begun the period, begin it again; it is still unused.
   const i64 period = now / quota.period_ns;
   if (period > 0 && period * quota.period_ns == now) quota.period = period - 1;
 }
 
-// Opens or shuts a server by its quota; its clock must be up to date.
+// Stops a server if its quota is used up, else lets it run; its clock must be up to date.
 //
-// While anything runs there is an event at every boundary of a period and wherever the quota is
-// used up, so nothing that was spent belongs to two periods. With a slack the quota fills a pool,
-// and what runs draws all of it whenever it has used up what it had.
+// While jobs or threads run there is an event at every begin of a period and whenever the quota is
+// used up; all core time between two events therefore belongs to one period. With a slack the quota
+// fills a pool, and a busy server draws the full pool whenever its share is used up.
 template <class S>
 void refill(S& s, Server& server, i64 now) {
   Quota& quota = s.quotas[server.quota];
@@ -61,9 +61,9 @@ void refill(S& s, Server& server, i64 now) {
   set_speed(s, server);
 }
 
-// Draws on the pool where what was drawn before is used up; the clock must be up to date.
+// Draws from the pool if the previous share is used up; the clock must be up to date.
 //
-// Only after all changes of this instant: what ends now draws nothing.
+// Called after all changes of this instant: a job that ends now draws nothing.
 template <class S>
 void draw_quota(S& s, Server& server, i64 now) {
   Quota& quota = s.quotas[server.quota];
@@ -80,7 +80,7 @@ void draw_quota(S& s, Server& server, i64 now) {
   }
 }
 
-// Announces when a server's quota is used up or renewed; an older announcement goes stale.
+// Announces when a server's quota is used up or renewed; older announcements become invalid.
 template <class S>
 void announce_quota(S& s, Server& server, i64 now) {
   Quota& quota = s.quotas[server.quota];
@@ -93,7 +93,7 @@ void announce_quota(S& s, Server& server, i64 now) {
   const i64 busy = server.used + server.stress;
   if (busy + lent(s, server) == 0 || server.is_down) {
     quota.looks_ns = -1;
-    // Beyond the slack, what was drawn goes back.
+    // Return the unused share beyond the slack to the pool.
     if (is_pooled(s, server, quota) && quota.left_ns > quota.slack_ns) {
       const i64 pool_ns = quota.pool_ns + quota.left_ns - quota.slack_ns;
       quota.pool_ns = std::min(pool_ns, quota.quota_ns);
@@ -112,11 +112,11 @@ void announce_quota(S& s, Server& server, i64 now) {
   }
   if (at_ns == quota.looks_ns) return;
   quota.looks_ns = at_ns;
-  // The item of a change of a node is 0; that of a server's quota is its row, from 1.
+  // Item 0 is a change of a node; the item of a server's quota is the server's row plus 1.
   s.post(at_ns, make_key(kChange, 0, 0, &server - s.servers.rows + 1));
 }
 
-// A server's quota is used up or renewed, unless the announcement has gone stale.
+// Handles a server's quota that is used up or renewed, unless the announcement is invalid.
 template <class S>
 void look_at_quota(S& s, Server& server, i64 now) {
   Quota& quota = s.quotas[server.quota];

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import struct
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from functools import cached_property
@@ -53,7 +54,7 @@ def stream(seed: int, name: str) -> np.random.SeedSequence:
     all others unchanged.
     """
     digest = hashlib.blake2b(name.encode(), digest_size=16).digest()
-    words = tuple(int(word) for word in np.frombuffer(digest, dtype="<u4"))
+    words = struct.unpack("<4I", digest)
     return np.random.SeedSequence(seed, spawn_key=words)
 
 
@@ -82,7 +83,7 @@ def draw(
     shared : collection of str
         Nodes that the cell shares with others; their changes are sampled without the prefix.
     disturbances : sequence of Disturbance
-        All disturbances of shared nodes; they replace those of the scenario for these nodes.
+        All disturbances of shared nodes; for these nodes they replace the scenario's disturbances.
 
     Raises
     ------
@@ -182,8 +183,8 @@ def draw_shadows(
 ) -> Realisation:
     """Sample execution times, delays and losses of the shadow jobs in a realisation.
 
-    Releases, disturbances, scales and the rows of traces equal those of the realisation, because
-    they belong to the cycle or to the fabric.
+    Releases, disturbances, scales and the rows of traces are the same as in the realisation,
+    because they belong to the cycle or to the fabric.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-// What own jobs leave: the servers below others, on which shadow jobs run.
+// Remainders: servers below others, which give shadow jobs the cores that own jobs leave.
 //
-// Own jobs know nothing of them, so that their instants are those of a run without shadows; after
-// every event that a server has had a part in, what is left of it is counted anew.
+// Shadow jobs do not delay own jobs, except through a quota or the places of an accelerator. After
+// every event on a server its remainder is computed again.
 #pragma once
 
 #include "turns.h"
@@ -17,7 +17,7 @@ f64 rest_of(const S& s, const Server& server) {
   return load <= server.spare ? server.spare - own : server.spare * foreign / load;
 }
 
-// Counts what the jobs of a server below another add to its busy cores, and take of its background.
+// Computes the busy cores that the server below adds, and the background that it displaces.
 template <class S>
 void count_added(const S& s, const Server& server, Server& below) {
   const i64 busy = server.used + server.stress, cores = server.cores;
@@ -32,12 +32,12 @@ void count_added(const S& s, const Server& server, Server& below) {
   }
 }
 
-// Gives shadow jobs what own jobs leave of a server, which have been given their cores.
+// Assigns the remainder of a server to shadow jobs; own jobs already have their cores.
 template <class S>
 [[gnu::noinline]] void leave_rest(S& s, Server& server, i64 now) {
   Server& below = s.servers[server.below];
   tick(s, below, now);
-  // Where shadow jobs matter to own jobs, these are announced again after any change.
+  // If shadow jobs affect own jobs, completions of own jobs are announced again after any change.
   if (has_quota(s, server) || !server.is_cpu) tick(s, server, now);
   if (has_quota(s, server) && !takes_turns(s, server)) refill(s, server, now);
   below.stress = server.stress;
@@ -47,7 +47,7 @@ template <class S>
     set_speed(s, below);
   } else {
     below.cores = server.cores - server.used;
-    // Before all others, so that any job is behind it.
+    // Goes before every job, so any job can be preempted.
     const Waiting own{std::numeric_limits<i64>::min(), 0, 0, 0.0};
     while (below.used > below.cores && preempt(s, below, own)) {
     }
@@ -59,14 +59,14 @@ template <class S>
   schedule(s, below, now);
 }
 
-// Whether what an event did to a server matters to own jobs: of what is below only what draws on
-// their quota, or holds places.
+// Whether an event on a server affects own jobs. A change on the server below does so only if it
+// draws on their quota or occupies places.
 template <class S>
 bool is_concerned(const S& s, const Server& server) {
   return (server.is_dirty & kIsDirty) != 0 || has_quota(s, server) || !server.is_cpu;
 }
 
-// Whether an own job may want a place of an accelerator before a shadow job ends that begins now.
+// Whether an own job may want a place of an accelerator before a shadow job that starts now ends.
 template <class S>
 bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {
   const Server& server = s.servers[below.above];
@@ -90,7 +90,7 @@ bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {
   return false;
 }
 
-// Remembers the least time from a release to the readiness of an own job.
+// Updates the least time from a release to the readiness of an own job.
 template <class S>
 void note_soonest(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   if (S::kPlain || s.cell(cell).shadow < 0) return;
@@ -99,7 +99,7 @@ void note_soonest(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   if (soonest_ns < 0 || since_ns < soonest_ns) soonest_ns = since_ns;
 }
 
-// Takes a job off a server below another, wherever it is there; false if it is not.
+// Removes a running or waiting job from a server below another; returns false if it has none.
 template <class S>
 bool take_off(S& s, Server& server, const Site& site, i64 key, i64 now) {
   for (i64 at = 0; at < server.n_run + server.n_wait; ++at) {

@@ -1,12 +1,12 @@
-// The rows of the kernel's tables, and what it is handed: every table and how many rows it has.
+// The rows of the kernel's tables, and its argument: every table with its number of rows.
 //
-// Each field is declared here and nowhere else: the lists below make the structs, and layout.cpp
-// tells Python what fields they have, of which it makes structs of its own and types of arrays.
+// This file alone declares the fields. The lists below define the structs; layout.cpp describes
+// their fields to Python, which builds its own structs and array types from the description.
 //
-// A *site* is a task on one feasible node of one cell; a *server* is what executes jobs: the CPU of
-// a node, or one kind of its accelerators; a *hop* is a flow on a link. A cell may have a *shadow*:
-// another row of `cells`, with sites and hops of its own on the same servers and links, whose
-// cycles are released by those of its parent. A *pair* of candidates (active, other) is row
+// A *site* is a task on one feasible node of one cell. A *server* executes jobs: the CPU of a node,
+// or one kind of its accelerators. A *hop* is a flow on a link. A cell may have a *shadow*: another
+// row of `cells`, with its own sites and hops on the same servers and links. A release of a cycle
+// also releases the cycle's shadow. A *pair* of candidates (active, other) is row
 // `pair_0 + active * n_candidates + other` of `shadow_parts`. Times are nanoseconds.
 #pragma once
 
@@ -24,15 +24,15 @@ using u64 = std::uint64_t;
 using f64 = double;
 using Times = const i64*;
 
-// Number of strengths of a disturbance: those of a ramp's steps, and none
-// (dwell.model.scenario.RAMP_STEPS); and a number for each.
+// Number of strengths of a disturbance: one per step of a ramp
+// (dwell.model.scenario.RAMP_STEPS), and off. `Levels` and `Shares` have one number per strength.
 constexpr i64 kLevels = 32;
 using Levels = i64[kLevels];
 using Shares = f64[kLevels];
 
 struct Crossing;  // of meter.cpp
 
-// The lists are tables: a row of fields a line.
+// The lists are tables: one row of fields per line.
 // clang-format off
 
 // Numbers of the whole simulation. Up to `n_slots` cycles of a cell, a power of two, may be in
@@ -45,32 +45,33 @@ struct Crossing;  // of meter.cpp
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
   field(i64, n_priced) /* columns of the outputs */                                              \
   field(i64, margin) field(i64, budget)                                                          \
-  field(i64, logs_all) /* whether logs are of all cycles, or of those in the ring */             \
+  field(i64, logs_all) /* whether logs keep all cycles, or only the ring's */                    \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
   field(i64, n_held)                                                                             \
   field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
-  field(i64, pauses) /* whether a call ends when the cell is to be decided on */                 \
+  field(i64, pauses) /* whether a call ends when a decision is due */                            \
   field(i64, closed_cell)                                                                        \
   field(i64, step_key) field(i64, step_ns)                                                       \
-  field(i64, end_ns) /* of the last close that any cell can have */                              \
-  field(i64, plays_on) /* up to there, also where no window is left to close */
+  field(i64, end_ns) /* latest end of a window of any cell */                                    \
+  field(i64, plays_on) /* up to `end_ns`, even after the last window */
 
-// A window closes no earlier than `due_ns` after the release of its last cycle, and `grace_ns` after
-// that of the one beyond it. `wakes_ns` is when the guard is woken if no cycle from `waited` on has
-// been heard to complete, and `patience_ns` is g periods. Decisions that come more often than
-// windows look at `decide_cycles` cycles each, the next one at those before `look_cycle`, and the
-// first `look_0` of the placement in force begins with the cycle `since`; 0 for one a window.
+// A window ends `due_ns` after the release of its last cycle, or `grace_ns` after the release of
+// the next cycle, whichever is later. `wakes_ns` is the instant at which the guard is woken unless
+// it learns before that a cycle from `waited` on has completed. `patience_ns` is g periods.
+// `decide_cycles` is the number of cycles between decisions that are more frequent than windows; 0
+// for one decision per window. The next decision looks at cycles before `look_cycle`. `since` is
+// the first cycle under the placement in force, and `look_0` the first decision after it.
 #define DWELL_CELL(field)                                                                        \
   field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
   field(i64, close_pending) field(i64, window_cycles) field(i64, migrating)                      \
   field(i64, decide_cycles) field(i64, since) field(i64, look_0) field(i64, look)                \
   field(i64, look_cycle) field(i64, look_pending)                                                \
-  field(i64, deadline_ns) field(f64, longest_ms) /* with which latencies beyond it count */       \
+  field(i64, deadline_ns) field(f64, longest_ms) /* larger latencies count as this */            \
   field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited)                                \
   field(i64, period_ns) field(i64, released) /* cycles */                                        \
-  field(i64, given_up_after) /* cycles released since, of a shadow under way */                  \
+  field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
@@ -82,9 +83,9 @@ struct Crossing;  // of meter.cpp
 
 #define DWELL_FLOW(field) field(i32, source) field(i32, target)
 
-// What a job uses of its server, `need`, is the cores that it holds, the threads that share them
-// where the server is fair, or a place. Its work is done by `threads` threads. `own` is the row of
-// its cell and server in `own_ns`.
+// A job occupies `need` of its server: cores, or threads that share the cores of a fair server, or
+// places of an accelerator. `threads` threads do its work. `own` is the row of its cell and server
+// in `own_ns`.
 #define DWELL_SITE(field)                                                                        \
   field(Times, exec_ns)                                                                          \
   field(i64, need) field(i64, threads)                                                           \
@@ -95,11 +96,12 @@ struct Crossing;  // of meter.cpp
   field(i64, workers) field(i64, start_ns)                                                       \
   field(i64, mean_ns) /* of `exec_ns`, as the file states it */
 
-// `busy_ns` is in core-nanoseconds, of which 64 bits may not hold those of all cores. `quota` is a
-// row of `quotas`, -1 for none. Shadow jobs run on a server of their own, `below` that of the own
-// jobs, which is `above` it; -1 for none. To it `stress`, `is_down` and `is_stopped` are copied,
-// `cores` and `spare` are what is left to it, and it adds `lent` busy cores and `background` to
-// those above. `beside_ns` is what of `virtual_ns` went by beside foreign threads that interfere.
+// `busy_ns` is in core-nanoseconds, a double because the sum over all cores may exceed 64 bits.
+// `quota` is a row of `quotas`, -1 for none. Shadow jobs have their own server: the row `below` of
+// the own jobs' server; `above` points back; -1 for none. The server below copies `stress`,
+// `is_down` and `is_stopped`; its `cores` and `spare` are the rest that own jobs leave; it adds
+// `lent` busy cores and `background` to the server above. `beside_ns` is the part of `virtual_ns`
+// during which foreign threads interfered.
 #define DWELL_SERVER(field)                                                                      \
   field(f64, virtual_ns) field(f64, beside_ns) field(f64, speed)                                 \
   field(i64, last_ns) field(i64, next_ns) field(i64, next_key)                                   \
@@ -111,12 +113,13 @@ struct Crossing;  // of meter.cpp
   field(f64, busy_ns) field(f64, behind_ns) field(f64, spare) field(f64, background)             \
   field(f64, beside) field(f64, used_ns) /* integral of `used` */
 
-// `tick_ns` is the time between ticks, 0 for a quota that is noticed at once; at time 0 the last
-// tick was `tick_ago_ns` and the last begin of a period `period_ago_ns` ago. `has_turn` says
-// whether a thread has the turn, `turn_begun_ns` what it had received before, and `turn_ns` what
-// since; a turn lasts `least_ns` at least. `drawn_ns` is what is drawn on a pool at a time.
-// `wakes_ns` is when something of the background wakes next, for the `wakes`-th time, and
-// `wake_gap_ns` the mean time between two. All that a quota counts is in time of the core.
+// `tick_ns` is the time between ticks, 0 for a quota that takes effect at once. At time 0 the last
+// tick was `tick_ago_ns` ago, and the period had begun `period_ago_ns` ago. `has_turn` is 1 if a
+// thread has the turn; `turn_begun_ns` is the core time that it had received before its turn, and
+// `turn_ns` the core time since. A turn lasts `least_ns` at least. `drawn_ns` is the core time
+// drawn from a pool at once. `wakes_ns` is the next instant at which a background thread wakes,
+// `wakes` counts the wakes, and `wake_gap_ns` is the mean time between them. Quotas count core
+// time.
 #define DWELL_QUOTA(field)                                                                       \
   field(i64, looks_ns)                                                                           \
   field(i64, period_ns) field(i64, period) field(i64, quota_ns) field(i64, stressed_ns)          \
@@ -129,7 +132,7 @@ struct Crossing;  // of meter.cpp
 // Servers of a node: its CPU first.
 #define DWELL_NODE(field) field(i32, server_0) field(i32, n_servers)
 
-// Rows of a realisation's `NodeChanges`, and of its `LinkSegments`, as they are.
+// Rows of a realisation's `NodeChanges` and `LinkSegments`, unchanged.
 #define DWELL_CHANGE(field)                                                                      \
   field(i64, at_ns) field(i64, node) field(i64, stress) field(i64, is_down)
 #define DWELL_SEGMENT(field)                                                                     \
@@ -139,13 +142,13 @@ struct Crossing;  // of meter.cpp
 #define DWELL_HOP(field)                                                                         \
   field(Times, delay_ns) field(u64, loss_key) field(i64, payload_bytes) field(i64, link)
 
-// `retransmit_ns` is -1 where what is lost is lost.
+// `retransmit_ns` is -1 for a link that drops messages for good.
 #define DWELL_LINK(field)                                                                        \
   field(i64, free_ns) field(i64, last_arrival_ns) field(i64, retransmit_ns)                      \
   field(i64, in_order) field(i64, n_held) field(i64, segment) field(i64, segment_end)
 
-// A message that waits for those before it, or is being repeated (order.h): the event of its
-// arrival, and when that would be without the wait.
+// A message that waits for earlier messages, or is being repeated (order.h): the event of its
+// arrival, and its arrival time without the wait.
 #define DWELL_HELD(field) field(i64, key) field(i64, link) field(i64, arrival_ns)
 
 #define DWELL_EVENT(field) field(i64, at_ns) field(i64, key)
@@ -157,33 +160,34 @@ struct Crossing;  // of meter.cpp
 #define DWELL_WAITING(field)                                                                     \
   field(i64, rank) field(i64, ready_ns) field(i64, key) field(f64, left_ns)
 
-// A job in flight. `missing` counts the inputs that have not arrived. `beside_ns` is what it did
-// beside foreign threads, by the `beside_ns` of its server; less that clock while it runs.
+// A job in flight. `missing` counts the inputs that have not arrived. `beside_ns` is the work done
+// while foreign threads interfered, measured by the clock `beside_ns` of its server; while the job
+// runs, less the clock at its start.
 #define DWELL_JOB(field)                                                                         \
   field(i64, ready_ns) field(i64, started_ns) field(i64, compute_ns) field(i64, network_ns)      \
   field(i64, next) field(f64, beside_ns) field(i32, site)                    \
   field(i32, missing)
 
-// A cycle in flight. `live` counts its jobs and messages that are under way.
+// A cycle in flight. `live` counts its jobs and messages in flight.
 #define DWELL_SLOT(field)                                                                        \
   field(i64, cycle) field(i32, candidate) field(i32, pair) field(i32, live)                      \
   field(i32, sinks_left) field(i32, is_lost)
 
-// `used_ns` is the integral of `used` of the job's server while the job ran, and `above_ns` that of
-// the server above it; both where cells share servers.
+// `used_ns` is the integral of `used` of the job's server while the job ran; `above_ns` is the same
+// integral for the server above. Both are kept only if cells share servers.
 #define DWELL_LOG(field)                                                                         \
   field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)               \
   field(i64, used_ns) field(i64, above_ns)
 
-// Cycles as they could be known when a window closed, or a decision was due: `uncut_ms` is L95
-// without the cell's `longest_ms`.
+// Metrics of cycles as known at the end of a window, or when a decision was due. `uncut_ms` is L95
+// without the limit `longest_ms` of the cell.
 #define DWELL_SEEN(field)                                                                        \
   field(i64, first_cycle) field(i64, cycles) field(i64, missed)                                  \
   field(f64, l95_ms) field(f64, uncut_ms)
 
-// What a built-in policy with the estimator `profile` decides by (rules.h): its own numbers, the
-// objective's, where the cell is, and what `ATP` has added up since its last decision. Of two
-// numbers with the same name in `Objective` one is a weight and one a target.
+// Numbers by which a built-in policy with the estimator `profile` decides (rules.h): the policy's
+// parameters and the objective's, the placements of the cell, and the sums of `ATP` since its last
+// decision. `Objective` has both a weight and a target under some names.
 #define DWELL_RULE(field)                                                                        \
   field(i64, policy) field(i64, is_priced)                                                       \
   field(i64, incumbent) field(i64, previous) field(i64, dwell) field(i64, stamped)               \
@@ -197,86 +201,98 @@ struct Crossing;  // of meter.cpp
   field(f64, weight_latency) field(f64, weight_violations) field(f64, weight_robot)              \
   field(f64, weight_edge) field(f64, weight_cloud) field(f64, weight_switching)                  \
   field(f64, target_ms) field(f64, target_robot) field(f64, target_edge)                         \
-  field(f64, target_cloud) /* 0 where clouds are not weighed apart */                            \
+  field(f64, target_cloud) /* 0 if clouds have no own weight */                                  \
   field(f64, cap_ms) field(f64, cap_utilisation)
 
-// A candidate: what is expected of it, its cumulative sum, and whether its toggled task is on a
+// A candidate: its expected metrics, its cumulative sum, and whether its toggled task is on a
 // robot.
 #define DWELL_OPTION(field)                                                                      \
   field(f64, l95_ms) field(f64, uncut_ms) field(f64, violation_rate) field(f64, sum)             \
   field(i64, on_robot)
 
-// The decision at the close of a window; `measured` is J of the window itself.
+// The decision at the end of a window; `measured` is J of the window itself.
 #define DWELL_DECIDED(field)                                                                     \
   field(f64, measured) field(f64, delta_j) field(i64, dwell)                                     \
   field(i32, incumbent) field(i32, placement) field(i32, reason)
 
-// Intervals in order, none of which begins before the one ahead of it has ended (see
-// on_off_intervals.h); `passed` counts the begins and ends that are over.
+// Intervals in order, without overlap (see on_off_intervals.h). `passed` counts the begins and ends
+// that are over.
 #define DWELL_ON_OFF(field)                                                                      \
   field(Times, begin_ns) field(Times, end_ns) field(Times, levels) field(i64, count)             \
   field(i64, passed)
 
-// What one disturbance does to a node.
+// The effect of one disturbance on a node.
 #define DWELL_EFFECT(field)                                                                      \
   field(OnOffIntervals, intervals) field(i64, node) field(i64, down) field(Levels, threads)
 
-// What one disturbance does to a link; `arriving` is the share of attempts that it does not lose.
+// The effect of one disturbance on a link; `arriving` is the share of attempts that are not lost.
 #define DWELL_FAULT(field)                                                                       \
   field(OnOffIntervals, intervals) field(i64, down) field(Levels, layers)                        \
   field(Shares, arriving) field(Shares, rate_mbps)
 
-// A path of a random process and how far it is drawn (draw.cpp). `location` is the value of a
-// constant, the lower end of a uniform one, else the normal's mean; `spread` the length of the
-// interval, else the normal's deviation; no normal value is below `least`. Of a lognormal one
-// `correlation` is that of a cycle's logarithm with the cycle's before, `gain` sqrt(1 -
-// correlation^2), and `last` the last standard normal, NaN where the path has not begun.
+// A path of a random process, and the state of its sampling (draw.cpp). `location` is the value of
+// a constant process, the lower end of a uniform distribution, or the mean of the normal; `spread`
+// is the length of the uniform interval, or the deviation of the normal. A normal value is at least
+// `least`. For a lognormal process, `correlation` is the correlation of the logarithms of
+// consecutive cycles, `gain` is sqrt(1 - correlation^2), and `last` is the last standard normal,
+// NaN before the first.
 #define DWELL_PATH(field)                                                                        \
   field(Sfc64, stream) field(i64, kind) field(f64, location) field(f64, spread)                  \
   field(f64, least) field(f64, correlation) field(f64, gain) field(f64, last)
 
-// What cycles under one candidate go through (meter.cpp): the source of each flow, then in row 0 for
-// the cycles themselves, in row 1 + i for their shadows through candidate i, the part of each task
-// and of each flow, -1 for none of their own, and whether a flow's source is shared with the cycle.
+// The parts of cycles under one candidate (meter.cpp). `sources` has the source of each flow.
+// `parts` has the part of each task and of each flow, -1 for none; row 0 describes the cycles, row
+// 1 + i their shadows through candidate i. `shared` shows whether a shadow's flow starts at a task
+// that it shares with the cycle.
 #define DWELL_LAYOUT(field)                                                                      \
   field(i64, n_tasks) field(i64, n_flows) field(Times, sources) field(Times, parts)              \
   field(const i8*, shared)
 
-// A row per cycle of a window: the candidate that it went through, when its jobs became ready, when
-// they completed, when its messages arrived, the core time of its jobs, and when they started, -1
-// for what had not come or is not known; then, if there are shadows, the same of its shadow, the
-// candidate being -1 where it has none.
+// One row per cycle of a window: the candidate of the cycle; the instants at which its jobs became
+// ready, its jobs completed and its messages arrived; the core time of its jobs; the instants at
+// which they started. -1 marks future and unknown values. If there are shadows, the same columns
+// follow for the cycle's shadow, with candidate -1 for a cycle without one.
 #define DWELL_WINDOW(field) field(i64*, rows) field(i64, n) field(i64, width)
 
-// The jobs of a node (jobs.cpp): `cores` of each candidate and task, 0 for a task that is not there;
-// cores of the node, and those that its background leaves; foreign threads next to jobs, and the
-// share of the time in which there are bursts.
+// The jobs of a node (jobs.cpp): `cores` of each candidate and task, 0 for a task on another node;
+// cores of the node, and cores left by its background; foreign threads next to jobs; the share of
+// the time with bursts.
 #define DWELL_NODE_JOBS(field)                                                                   \
   field(i64, n_tasks) field(i64, n_flows) field(const f64*, cores) field(i64, is_fair)           \
   field(f64, n_cores) field(f64, spare) field(f64, foreign) field(f64, bursts)
 
-// The times found: up to `most` of each part, and the parts in the order in which they were found.
-// Where demands are asked for, and not times, there is a `cost` of each part: of a job its time
-// alone over its core time, of a message the nanoseconds that its link takes to send it; a `link`
-// on which messages wait, -1 for none; and whether it `repeats` messages and keeps their order.
+// The times found: up to `most` per part, and the parts in the order in which they were found.
+// If the caller wants demands instead of times, each part has a `cost`: for a job the ratio of its
+// time alone to its core time, for a message its transmission time in nanoseconds. Each part also
+// has the `link` on which messages wait, -1 for none, and the flag `repeats` of links that repeat
+// messages and keep their order.
 #define DWELL_FOUND(field)                                                                       \
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
   field(Crossing*, crossings) field(i64, n_crossings)
 
-// What a window has brought of a part: how many values, and the sums of their places.
+// The values of a part from a single window: their number, and the sums of their places.
 #define DWELL_CHUNK(field)                                                                       \
   field(i64, window) field(i64, cycles) field(i64, size)                                         \
   field(f64, larger) field(f64, smaller) field(f64, places)
 
-// What is held of a part (pools.cpp): its `n_known` values as declared, ascending, of which stretches
-// of `block` cycles are alike by `likeness`; `size` values since `first`, with the sums of their
-// places; the windows that they are from, and all cycles of those; for how many cycles they have not
-// been as declared; how many were measured; and the windows of the last of them, and in which it
-// last ceased to be as declared, or got another value since; whether Python asks for the next window;
-// how often the held values have changed; whether Python doubts that they still hold;
-// the cycles and sums of a run of windows that are larger, or smaller, 0 for none; and the values,
-// ascending, that were held before it, 0 where these are the declared ones.
+// The values of a part (pools.cpp).
+//
+// Declared: `known` has `n_known` values, ascending; `likeness` is the mean correlation of two
+// values within a stretch of `block` cycles. `guide` counts the declared values below each of equal
+// parts of their range.
+//
+// Held: `size` values from row `first` of `held`, with the sums of their places; `chunks` are the
+// windows of these values, `cycles` all cycles of the windows. `lasting` counts the cycles for
+// which the values have deviated from the declared values. `measured` counts measured values,
+// `last` is the window of the newest, `touched` the window in which the pool last stopped being as
+// declared, or last received a value since. `changes` counts the changes of the held values.
+//
+// Python sets `asks` to receive the next window, and `doubts` while it tests the held values.
+//
+// The `run_` fields are the cycles and the sums of a run of windows with larger, or with smaller,
+// values; 0 cycles for none. `before` has the `n_before` values, ascending, that were held before
+// the run; 0 stands for the declared values.
 #define DWELL_POOL(field)                                                                        \
   field(const f64*, known) field(i64, n_known) field(f64, patience_ms) field(f64, likeness)      \
   field(i64, block) field(f64*, held) field(i64, first) field(i64, size)                         \
@@ -286,7 +302,8 @@ struct Crossing;  // of meter.cpp
   field(i64, touched) field(i64, is_declared) field(i64, asks) field(i64, changes)                \
   field(i64, doubts) field(i64, run_cycles) field(i64, run_size)                                                    \
   field(f64, run_larger) field(f64, run_smaller) field(f64, run_places)                          \
-  field(f64*, before) field(i64, n_before)
+  field(f64*, before) field(i64, n_before)                                                       \
+  field(const i32*, guide) field(f64, guide_low) field(f64, guide_parts_per_ms)
 
 #define DWELL_ROWS(row)                                                                          \
   row(Clock, DWELL_CLOCK) row(Cell, DWELL_CELL) row(Task, DWELL_TASK) row(Flow, DWELL_FLOW)      \
@@ -315,8 +332,8 @@ DWELL_ROWS(DWELL_STRUCT)
 
 // clang-format off
 
-// Fixed, then state, then outputs: per cycle, per window, and logs where they are kept. Shapes are
-// in rows.py.
+// Fixed tables, then state, then outputs: per cycle, per window, and optional logs. rows.py has the
+// shapes.
 #define DWELL_TABLES(table)                                                                      \
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
   table(i32, outputs) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
@@ -338,7 +355,7 @@ DWELL_ROWS(DWELL_STRUCT)
 
 // clang-format on
 
-// A table and how many rows, or numbers, it has.
+// A table and its number of rows, or of numbers.
 template <class Row>
 struct Table {
   Row* rows;

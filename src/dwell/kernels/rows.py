@@ -94,21 +94,21 @@ class Tables(NamedTuple):
     flows: Rows  # (flows,)
     outputs: NDArray[np.int32]  # flows out of each task, in the order of the file
     cell_servers: NDArray[np.int32]  # servers of each cell's resources
-    capacity: Floats  # cores, or places, of each of them
+    capacity: Floats  # cores, or places, of each of these servers
     nodes: Rows  # (nodes,)
     site_of: NDArray[np.int32]  # (candidates, tasks) -> site
     route: NDArray[np.int32]  # (candidates, flows) -> hop, or -1 on the same node
-    back_ns: Ints  # (candidates,) time from a completion until the guard hears of it
+    back_ns: Ints  # (candidates,) time from a completion until the guard learns of it
     shadow_parts: NDArray[np.int8]  # (pairs of candidates, tasks)
     hops: Rows  # (hops,)
     layers: NDArray[np.uint64]  # (hops, layers) address of the extra delays, 0 for none
     segments: Rows  # (segments,)
     rates: Rows  # (segments,)
     changes: Rows  # (changes,)
-    work: Floats  # (candidates, resources) own work, or empty; as all below that a rule needs
+    work: Floats  # (candidates, resources) own work; empty, like the next two, without a rule
     switching: Floats  # (candidates, candidates) share of tasks moved
     tiers: NDArray[np.int8]  # (resources,)
-    stamps: NDArray[np.int16]  # (cells, N) candidate of each cycle; -1 where a shadow has none
+    stamps: NDArray[np.int16]  # (cells, N) candidate of each cycle; -1 for a cycle without shadow
     # state
     sites: Rows  # (sites,)
     servers: Rows  # (servers,)
@@ -124,23 +124,23 @@ class Tables(NamedTuple):
     ready: Ints  # jobs that the event has made ready
     jobs: Rows  # (cells * slots * tasks,)
     slots: Rows  # (cells * slots,)
-    attempts: Ints  # (cells * slots, flows) attempts lost so far, less one
+    attempts: Ints  # (cells * slots, flows) number of the last lost attempt, from 0
     own_ns: Floats  # (cells, resources of a cell) core-nanoseconds of completed own work
-    soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 before one
-    ages: Ints  # (W,) of one window
-    rule: Rows  # (1,), or empty where Python decides
+    soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 if unknown
+    ages: Ints  # (W,) scratch: latency, or age if unfinished, of the cycles of a window
+    rule: Rows  # (1,), or empty if Python decides
     options: Rows  # (candidates,)
-    shown: Floats  # (resources, candidates) what one showed under each since it is full; else 1
+    shown: Floats  # (resources, candidates) last share under a candidate, kept while full; else 1
     # outputs
     latency_ns: Ints  # (cells, N), NEVER_NS until done
     compute_ns: Ints
     network_ns: Ints
     outcome: NDArray[np.int8]
     opened: Floats  # (cells, windows, PARTS, resources) at first releases
-    closed: Floats  # (cells, windows, PARTS, resources) at closes
-    seen: Rows  # (cells, windows) metrics as they could be known at closes
+    closed: Floats  # (cells, windows, PARTS, resources) at the end of windows
+    seen: Rows  # (cells, windows) metrics as known at the end of windows
     shares: Floats  # (cells, windows, PARTS, resources) of the cores or places
-    look_opened: Floats  # (cells, looks, 2, PARTS, resources) since the last decision, and of W
+    look_opened: Floats  # (cells, looks, 2, PARTS, resources) since the last decision; for W cycles
     look_closed: Floats  # (cells, looks, PARTS, resources) when a decision is due
     looked: Rows  # (cells, looks) metrics of the cycles that a decision looks at
     look_shares: Floats  # (cells, looks, 2, PARTS, resources)
@@ -148,7 +148,7 @@ class Tables(NamedTuple):
     priced: (
         Floats  # (decisions, columns) by candidate: J, L95, V_D, U of each node, is within, excess
     )
-    shadow_bytes: Ints  # (N,) what the shadow of each cycle put on links, or empty
+    shadow_bytes: Ints  # (N,) bytes that the shadow of each cycle sent on links, or empty
     log: Rows  # (cells * L * tasks,), L being N or the slots (`logs_all`); or empty
     log_outcome: NDArray[np.int8]
     log_arrived: Ints  # (cells * L, flows), or empty

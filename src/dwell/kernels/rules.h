@@ -1,8 +1,8 @@
-// What built-in policies with the estimator `profile` decide at the close of a window.
+// Decisions of built-in policies with the estimator `profile` at the end of a window.
 //
-// A second body of the classes of dwell.policies and dwell.estimators.profile, which define what is
-// right; it gives every bit of what they give. It works on the one cell of a simulation. Bounds of
-// the model keep every J finite.
+// A second implementation of classes of dwell.policies and dwell.estimators.profile. These classes
+// are the reference; the results here equal theirs bit for bit. The simulation has a single cell.
+// Bounds of the model keep every J finite.
 #pragma once
 
 #include <cmath>
@@ -11,9 +11,9 @@
 
 namespace dwell {
 
-// From this share on a resource is full: what more is asked of it cannot be seen any more.
+// A resource is saturated from this share on: measurements cannot show any further demand.
 constexpr f64 kSaturated = 0.995;
-// Candidates this close to the least relative excess are told apart by J instead.
+// J decides between candidates whose relative excess is this close to the least.
 constexpr f64 kExcessTolerance = 1e-6;
 
 // U_r, U_e and U_c.
@@ -21,7 +21,7 @@ struct Used {
   f64 tier[kNoTier];
 };
 
-// The numbers of one decision: a column a candidate, in the order of the table of decisions.
+// The numbers of one decision: one column per candidate, in the order of the table of decisions.
 template <class S>
 struct Priced {
   S& s;
@@ -46,7 +46,7 @@ struct Priced {
   f64 uncut_ms(i64 c) const {
     return c == s.rule[0].incumbent ? seen.uncut_ms : s.options[c].uncut_ms;
   }
-  // Utilisation of the busiest resource, a saturated one counting as full.
+  // Utilisation of the busiest resource; a saturated resource counts as full.
   f64 busiest(i64 c) {
     f64 largest = 0.0;
     for (i64 i = 0; i < n_resources; ++i) largest = std::max(largest, used(i, c));
@@ -75,8 +75,8 @@ Used used_by_tiers(Priced<S>& priced, i64 candidate) {
   return used;
 }
 
-// Expects of every candidate what its profile says, beside what others were seen to use. The
-// incumbent's utilisation is the one of the cycles that the decision looks at.
+// Estimates every candidate from its profile, and adds the measured utilisation of others. The
+// incumbent's utilisation is measured over the cycles that the decision looks at.
 template <class S>
 void estimate(Priced<S>& priced, const f64* recent, const f64* observed) {
   const f64 *used = recent, *own = used + priced.s.clock[0].n_resources;
@@ -106,7 +106,7 @@ void estimate(Priced<S>& priced, const f64* recent, const f64* observed) {
   }
 }
 
-// By how much a candidate is over a cap at most, relative to it.
+// Largest relative excess of a candidate over a cap; negative if it is within all caps.
 template <class S>
 f64 excess(Priced<S>& priced, i64 candidate) {
   const Rule& rule = priced.s.rule[0];
@@ -114,8 +114,7 @@ f64 excess(Priced<S>& priced, i64 candidate) {
   return std::max(latency, priced.busiest(candidate) / rule.cap_utilisation) - 1.0;
 }
 
-// Which candidates may be chosen: those within the caps, or, where none is, those that are closest
-// to them.
+// Eligible candidates: all within the caps, or, if no candidate is, all with the least excess.
 template <class S>
 struct Eligible {
   Priced<S>& priced;
@@ -167,7 +166,7 @@ i64 cheapest(Priced<S>& priced, Among is_among) {
   return best;
 }
 
-// Why the cell moves to a candidate.
+// Reason for a move to a candidate.
 template <class S>
 Reason reason_of(Priced<S>& priced, i64 best, const Eligible<S>& eligible) {
   if (!eligible.within_caps) return kInfeasible;
@@ -285,8 +284,8 @@ Choice choose(Priced<S>& priced, f64 measured, f64 alone) {
   return {incumbent, kHold, NAN};
 }
 
-// Decides on a window that has closed, or on the cycles that a decision looks at; false where the
-// caller has to carry it out.
+// Decides after a window, or on the cycles that a decision looks at; returns false if the decision
+// is a move, which the caller carries out.
 template <class S>
 bool decide(S& s, i64 decision) {
   Rule& rule = s.rule[0];
@@ -327,7 +326,7 @@ bool decide(S& s, i64 decision) {
   return !moves;
 }
 
-// Stamps the cycles that may be released before the next decision.
+// Assigns the incumbent to the cycles that may be released before the next decision.
 template <class S>
 void stamp_next(S& s) {
   const Cell& cell = s.cell(0);

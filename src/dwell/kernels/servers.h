@@ -1,10 +1,11 @@
-// Servers: who runs at what speed, and when the next job completes.
+// Servers: the speed of running jobs, and the next completion.
 //
-// All running jobs of a server advance at one common speed, so a virtual clock that advances at
-// that speed turns processor sharing into a heap: a job that starts at virtual time v with c
-// nanoseconds of work ends at virtual time v + c, whoever comes or goes meanwhile. A job that holds
-// fewer cores than it has threads has so much more work. The virtual clock is set back to 0
-// whenever the server runs empty, which keeps its rounding error below a picosecond in practice.
+// All running jobs of a server advance at one common speed, and so does a virtual clock. The clock
+// turns processor sharing into a heap: a job that starts at virtual time v with c nanoseconds of
+// work ends at virtual time v + c, even if other jobs start or end before. The work of a job that
+// holds fewer cores than it has threads is scaled by threads / cores. The virtual clock is reset to
+// 0 when a job starts on an empty server, which keeps its rounding error below a picosecond in
+// practice.
 #pragma once
 
 #include <algorithm>
@@ -15,13 +16,13 @@
 
 namespace dwell {
 
-// Why a server has to be looked after: its own jobs, or only those of the server below it.
+// Why a server is in `dirty`: its own jobs changed, or only jobs of the server below it.
 enum Dirty : i8 { kIsDirty = 1, kBelowIsDirty = 2 };
 
 // Work left below this many nanoseconds is rounding, not work.
 constexpr f64 kSlackNs = 1e-3;
 
-// Quotas (quotas.h) and turns (turns.h) of servers that have some.
+// Defined in quotas.h and turns.h.
 template <class S>
 void refill(S& s, Server& server, i64 now);
 template <class S>
@@ -32,7 +33,7 @@ template <class S>
 void line_up(S& s, Server& server, const Job& job, i64 key, i64 work_ns, i64 now);
 inline void end_turn(Quota& quota);
 
-// What is due on an accelerator (remainders.h).
+// Defined in remainders.h.
 template <class S>
 bool is_awaited(const S& s, const Server& server, const Site& site, i64 now);
 
@@ -56,14 +57,14 @@ Waiting* waiting_of(const S& s, const Server& server) {
   return &s.waiting[server.base];
 }
 
-// How long a job of some execution time takes with the cores that it holds, undisturbed.
+// Undisturbed duration of a job with the cores that it holds; `work_ns` is its execution time.
 inline f64 time_alone(const Site& site, i64 work_ns) {
   const f64 work = static_cast<f64>(work_ns);
   if (site.need == site.threads) return work;
   return work * static_cast<f64>(site.threads) / static_cast<f64>(site.need);
 }
 
-// Whether a server is what own jobs leave of another to shadow jobs.
+// Whether a server is the rest of another server, left by own jobs to shadow jobs.
 template <class S>
 bool is_below(const S&, const Server& server) {
   return !S::kPlain && server.above >= 0;
@@ -74,7 +75,7 @@ bool has_below(const S&, const Server& server) {
   return !S::kPlain && server.below >= 0;
 }
 
-// Whether there are shadow jobs to which a server leaves anything.
+// Whether shadow jobs run or wait on the server below.
 template <class S>
 bool is_shared(const S& s, const Server& server) {
   if (!has_below(s, server)) return false;
@@ -82,14 +83,14 @@ bool is_shared(const S& s, const Server& server) {
   return below.n_run + below.n_wait > 0;
 }
 
-// Cores that shadow jobs add to those that draw on a server's quota.
+// Busy cores of shadow jobs that draw on a server's quota.
 template <class S>
 i64 lent(const S&, const Server& server) {
   return S::kPlain ? 0 : server.lent;
 }
 
-// Remembers that a server must give out cores at the end of the event; one that is below another
-// does so after it.
+// Marks a server that must assign cores at the end of the event. A server below another does so
+// after the server above.
 template <class S>
 void mark(S& s, Server& server) {
   Server& first = is_below(s, server) ? s.servers[server.above] : server;
@@ -97,19 +98,19 @@ void mark(S& s, Server& server) {
   first.is_dirty |= is_below(s, server) ? kBelowIsDirty : kIsDirty;
 }
 
-// Whether logs say next to which jobs of other cells a job ran.
+// Whether logs have the integrals of the threads that ran at the same time as a job.
 template <class S>
 bool logs_beside(const S& s) {
   return !S::kPlain && s.log.size > 0 && s.clock[0].has_shared != 0;
 }
 
-// Integral of the threads, or places, that jobs have used of a server up to now.
+// Integral, up to now, of the threads or places of a server that jobs use.
 inline i64 used_until(const Server& server, i64 now) {
   const f64 since_ns = static_cast<f64>(now - server.last_ns);
   return whole_ns(std::rint(server.used_ns + since_ns * static_cast<f64>(server.used)));
 }
 
-// Integrals for a job of a server, as its log has them.
+// Adds a server's integrals to a log entry, or with sign -1 subtracts them.
 template <class S>
 void log_beside(const S& s, const Server& server, Log& entry, i64 sign, i64 now) {
   if (!logs_beside(s)) return;
@@ -117,7 +118,7 @@ void log_beside(const S& s, const Server& server, Log& entry, i64 sign, i64 now)
   if (is_below(s, server)) entry.above_ns += sign * used_until(s.servers[server.above], now);
 }
 
-// Brings a server's busy time up to now; returns the time since it last was.
+// Updates a server's busy time to now; returns the time since the last update.
 template <class S>
 i64 account(S& s, Server& server, i64 now) {
   const i64 elapsed = now - server.last_ns;
@@ -153,13 +154,13 @@ i64 account(S& s, Server& server, i64 now) {
   return elapsed;
 }
 
-// Whether it is counted what jobs do beside foreign threads, which takes them more core time.
+// Whether jobs need more core time next to foreign threads, so this work is counted separately.
 template <class S>
 bool counts_beside(const S&, const Server& server) {
   return !S::kPlain && server.beside != 1.0;
 }
 
-// Lets a time pass on a server's virtual clock.
+// Advances a server's virtual clock by an elapsed time.
 template <class S>
 void advance_clock(S& s, Server& server, i64 elapsed) {
   const f64 advanced = static_cast<f64>(elapsed) * server.speed;
@@ -167,7 +168,7 @@ void advance_clock(S& s, Server& server, i64 elapsed) {
   if (counts_beside(s, server) && server.stress > 0) server.beside_ns += advanced;
 }
 
-// Brings a server's virtual clock and busy time up to now.
+// Updates a server's virtual clock and busy time to now.
 template <class S>
 void tick(S& s, Server& server, i64 now) {
   const i64 elapsed = account(s, server, now);
@@ -176,9 +177,10 @@ void tick(S& s, Server& server, i64 now) {
 
 // Sets the common speed after threads, stress or quota changed; the clock must be up to date.
 //
-// With c' = c - b cores left by the background, fair: min(1, c' / (K + s)); fifo and priority:
-// c' / (c + s); in turns: the core among the threads of the job whose turn it is; any: less by what
-// foreign threads interfere, and 0 while the quota is used up.
+// With c' = c - b cores left by the background, K threads of jobs and s foreign threads, fair:
+// min(1, c' / (K + s)); fifo and priority: c' / (c + s); in turns: 1 / threads of the job that has
+// the turn. Next to foreign threads the speed is multiplied by `beside`; while the quota is used up
+// it is 0.
 template <class S>
 void set_speed(S& s, Server& server) {
   f64 speed;
@@ -196,7 +198,7 @@ void set_speed(S& s, Server& server) {
   server.speed = server.is_stopped ? 0.0 : speed;
 }
 
-// Announces a completion, unless that has been done; an older announcement goes stale.
+// Announces a completion, unless it is already announced; older announcements become invalid.
 template <class S>
 void announce(S& s, Server& server, i64 at_ns, i64 key) {
   if (key == server.next_key && at_ns == server.next_ns) return;
@@ -224,7 +226,7 @@ void schedule(S& s, Server& server, i64 now) {
   announce(s, server, later(now, wait), first.key);
 }
 
-// Notes that a worker begins with a job.
+// Records that a worker starts a job.
 template <class S>
 void note_start(S& s, i64 key, Job& job, i64 now) {
   job.started_ns = now;
@@ -234,7 +236,7 @@ void note_start(S& s, i64 key, Job& job, i64 now) {
   log_beside(s, s.server(s.site(job)), entry, -1, now);
 }
 
-// Lets a job run, or go on, that has so much work left.
+// Starts or resumes a job that has `left` nanoseconds of work.
 template <class S>
 void run(S& s, Server& server, i64 key, Job& job, f64 left, i64 now) {
   if (server.n_run == 0) server.virtual_ns = server.beside_ns = 0.0;
@@ -243,11 +245,11 @@ void run(S& s, Server& server, i64 key, Job& job, f64 left, i64 now) {
   push(running_of(s, server), server.n_run++, Running{server.virtual_ns + left, key});
 }
 
-// Notes what a job that stops running did beside foreign threads; the clock must be up to date.
+// Adds the work that a stopping job did next to foreign threads; the clock must be up to date.
 template <class S>
 void note_beside(S& s, const Server& server, const Running& row) {
   if (!counts_beside(s, server)) return;
-  // What the clock is past its end, which comes at a whole nanosecond, is not its work.
+  // The end is rounded up to a whole nanosecond: do not count the clock beyond the job's finish.
   const f64 past = server.stress > 0 ? std::min(row.finish_ns - server.virtual_ns, 0.0) : 0.0;
   s.job(row.key).beside_ns += server.beside_ns + past;
 }
@@ -258,18 +260,18 @@ void start(S& s, Server& server, const Site& site, i64 key, Job& job, f64 left, 
   server.used += site.need;
 }
 
-// Place of a job among others before its readiness counts; a smaller one goes first.
+// Rank of a job; the smallest runs first, and readiness decides between equal ranks.
 inline i64 rank_of(const Server& server, const Site& site) {
   return server.scheduler == kFifo ? 0 : site.rank;
 }
 
-// Adds a job to those that wait for cores, or a thread to those that wait for their turn.
+// Queues a job that waits for cores, or a thread that waits for its turn.
 template <class S>
 void queue_up(S& s, Server& server, const Waiting& row) {
   push(waiting_of(s, server), server.n_wait++, row);
 }
 
-// Takes the cores of the last running job behind another one, if there is any.
+// Preempts the last in order of the running jobs behind `last`; returns false if all precede it.
 template <class S>
 [[gnu::noinline]] bool preempt(S& s, Server& server, Waiting last) {
   Running* running = running_of(s, server);
@@ -292,20 +294,20 @@ template <class S>
   return true;
 }
 
-// Cores or places that cannot be given out: those of an accelerator also where shadow jobs run.
+// Occupied cores or places; on an accelerator, places of shadow jobs count too.
 template <class S>
 i64 taken(const S& s, const Server& server) {
   const bool shares = !server.is_cpu && has_below(s, server);
   return server.used + (shares ? s.servers[server.below].used : 0);
 }
 
-// Whether a job may begin that fits: a shadow job on an accelerator waits for what is due there.
+// Whether a job that fits may start: on an accelerator a shadow job waits for own jobs due soon.
 template <class S>
 bool may_begin(const S& s, const Server& server, const Site& site, i64 now) {
   return !is_below(s, server) || server.is_cpu || !is_awaited(s, server, site, now);
 }
 
-// Gives out the cores of a server that is not fair.
+// Assigns the cores of a server that is not fair.
 template <class S>
 void dispatch(S& s, Server& server, i64 now) {
   if (takes_turns(s, server)) {
@@ -328,12 +330,12 @@ void dispatch(S& s, Server& server, i64 now) {
   }
 }
 
-// Takes the job that finishes first off a server.
+// Removes the job that finishes first from a server.
 template <class S>
 void leave(S& s, Server& server, const Site& site, i64 now) {
   const i64 elapsed = account(s, server, now);
   const i64 n = server.n_run;
-  // The virtual clock of an empty server starts anew.
+  // The virtual clock of an empty server is reset with its next job.
   if (n > 1 || counts_beside(s, server)) advance_clock(s, server, elapsed);
   note_beside(s, server, *running_of(s, server));
   pop(running_of(s, server), n);
@@ -357,12 +359,13 @@ void admit(S& s, i64 key, i64 now) {
   const Site& site = s.site(job);
   Server& server = s.server(site);
   const i64 work_ns = site.exec_ns[cycle_of(key)];
+  S::fetch_next(site.exec_ns[cycle_of(key)]);
   if (takes_turns(s, server)) {
     line_up(s, server, job, key, work_ns, now);
     return;
   }
   const f64 left = time_alone(site, work_ns);
-  // Where nobody else can want the cores now, the job needs no queue.
+  // If no other job can want the cores now, skip the queue.
   const bool alone = server.n_wait == 0 && s.n_ready == 1;
   const bool fits = alone && !is_below(s, server) && taken(s, server) + site.need <= server.cores;
   if (has_quota(s, server)) {

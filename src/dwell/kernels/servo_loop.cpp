@@ -1,4 +1,4 @@
-// The reference visual-servo loop; servo_loop.py states what is computed, and its arguments.
+// The reference visual-servo loop; servo_loop.py describes the computation and its arguments.
 
 #include <algorithm>
 #include <cmath>
@@ -20,7 +20,7 @@ struct Hold {
   double velocity_after(double held) const noexcept { return velocity + acceleration * held; }
 };
 
-// Of the error: of its square, and of its absolute value.
+// Integrals of the error's square and of its absolute value.
 struct Integrals {
   double squared, absolute;
 };
@@ -30,9 +30,10 @@ namespace {
 // Status.
 constexpr int64_t kDone = 0, kDiverged = 1;
 
-// Halvings of the bracket of a zero before the secant: |e| is off by the square of what is left.
+// Halvings of the bracket of a zero before the secant; the error of the integral of |e| falls with
+// the square of the bracket.
 constexpr int kHalvings = 8;
-// Half of w h of the longest piece, and the error at which the loop counts as unstable, in A.
+// Half of w h of the longest piece, and the position beyond which the loop is unstable, in A.
 constexpr double kHalfPiece = 0.1;
 constexpr double kFar = 1e6;
 
@@ -43,7 +44,7 @@ struct Target {
   double amplitude, omega;
 };
 
-// The error over a piece of a hold, whose half is the unit of time.
+// The error over a piece of a hold; the unit of time is half the piece.
 struct Polynomial {
   double c0, c1, c2, c3, c4;
 
@@ -57,7 +58,7 @@ struct Polynomial {
   Polynomial slope() const noexcept { return {c1, 2 * c2, 3 * c3, 4 * c4, 0.0}; }
 };
 
-// The zero between two points where the signs differ.
+// The zero between two points with different signs.
 double zero(const Polynomial& e, double low, double high) noexcept {
   double at_low = e.at(low), at_high = e.at(high);
   for (int i = 0; i < kHalvings; ++i) {
@@ -74,7 +75,7 @@ double zero(const Polynomial& e, double low, double high) noexcept {
   return (low * at_high - high * at_low) / (at_high - at_low);
 }
 
-// The integral of |e| from -1 to 1; e turns once at most.
+// The integral of |e| from -1 to 1; e has one extremum at most.
 double integral_of_absolute(const Polynomial& e) noexcept {
   const double even = e.c0 + e.c2 + e.c4, odd = e.c1 + e.c3;
   const double slope_even = e.c1 + 3 * e.c3, slope_odd = 2 * e.c2 + 4 * e.c4;
@@ -161,7 +162,7 @@ DWELL_EXPORT int64_t dwell_follow(const double* measured_s, const double* actuat
     hold.velocity = holds[k].velocity_after(held);
     if (!(std::fabs(hold.position) < kFar * amplitude)) return kDiverged;
 
-    // What the camera saw, at an instant that may lie several holds back.
+    // The camera's measurement; its instant may be several holds earlier.
     const double at = measured_s[k];
     while (seen < k && actuated_s[seen] <= at) ++seen;
     const double before = at - holds[seen].since;

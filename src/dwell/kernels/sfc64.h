@@ -1,6 +1,6 @@
 #pragma once
 
-// SFC64 (Doty-Humphrey 2010, PractRand): the bit generator of every stream, as NumPy has it.
+// SFC64 (Doty-Humphrey 2010, PractRand): the bit generator of every stream, the same as NumPy's.
 
 #include <bit>
 #include <cstdint>

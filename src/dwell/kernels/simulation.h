@@ -1,4 +1,4 @@
-// A simulation in the hands of one call: its tables, its queue, and what one event leaves to do.
+// The state of a simulation during one call: its tables, its queue, and the work of one event.
 #pragma once
 
 #include "codes.h"
@@ -8,9 +8,8 @@
 
 namespace dwell {
 
-// What a simulation may need, known when it is compiled: what it does not need costs nothing.
-// `kQuotas`: some node has a quota. `kPlain`: it is of one cell, which has no shadow, and no job is
-// logged.
+// Features are constants at compile time, and unused features cost no time. `kQuotas`: some node
+// has a quota. `kPlain`: the simulation has one cell without a shadow, and logs no jobs.
 template <bool has_quotas, bool is_plain>
 struct Simulation : Tables {
   static constexpr bool kQuotas = has_quotas;
@@ -60,7 +59,15 @@ struct Simulation : Tables {
     return log_row(cell, cycle) * n_tasks + task;
   }
 
-  // Hop that a flow takes in a cycle, -1 on the same node.
+  // Prefetches the values of the next cycles, given a value of this cycle. With many cells the
+  // processor's own prefetching is too late.
+  template <class T>
+  static void fetch_next(const T& value) {
+    constexpr i64 kLineBytes = 64, kValues = kLineBytes / static_cast<i64>(sizeof(T));
+    if constexpr (!kPlain) __builtin_prefetch(&value + kValues);
+  }
+
+  // Hop of a flow in a cycle, -1 on the same node.
   i64 hop(i64 cell, i64 cycle, i64 flow) const {
     return route[slot(cell, cycle).candidate * n_flows + flow];
   }

@@ -1,7 +1,7 @@
-// Turns: where a quota is noticed at ticks, one thread at a time has the core.
+// Turns: if a quota takes effect at ticks, one thread at a time has the core.
 //
-// All but the one that has the turn are in the heap of those that wait, foreign threads too, by the
-// core time that each has received.
+// All other threads, foreign threads too, are in the heap of waiting threads, ordered by the core
+// time that each has received.
 #pragma once
 
 #include "elementary.h"
@@ -9,7 +9,7 @@
 
 namespace dwell {
 
-// Of those that have received the same, jobs go first.
+// Between equal core times, jobs go before foreign threads.
 constexpr i64 kLate = kLastNs;
 
 inline void end_turn(Quota& quota) {
@@ -17,10 +17,10 @@ inline void end_turn(Quota& quota) {
   quota.turn_ns = 0;
 }
 
-// Core time that the thread that has the turn has received; the clock must be up to date.
+// Core time that the current thread has received; the clock must be up to date.
 inline i64 received_by_turn(const Quota& quota) { return quota.turn_begun_ns + quota.turn_ns; }
 
-// Has the thread that has the turn wait for another; the clock must be up to date.
+// Returns the current thread to the heap of waiting threads; the clock must be up to date.
 template <class S>
 void put_back(S& s, Server& server, Quota& quota) {
   const i64 received = received_by_turn(quota);
@@ -36,15 +36,14 @@ void put_back(S& s, Server& server, Quota& quota) {
   end_turn(quota);
 }
 
-// Passes the turn on, if it has lasted long enough; the clock must be up to date.
+// Ends the turn, if it has lasted long enough; the clock must be up to date.
 template <class S>
 void pass_on(S& s, Server& server, Quota& quota) {
   if (quota.turn_ns >= quota.least_ns && !server.is_stopped) put_back(s, server, quota);
 }
 
-// Passes the turn on; the clock must be up to date.
-//
-// At a tick, if it has lasted long enough; at a wake, if another has received less.
+// Ends the turn at a tick, if it has lasted long enough, or at a wake, if a waiting thread has
+// received less; the clock must be up to date.
 template <class S>
 void strike(S& s, Server& server, Quota& quota, i64 now) {
   if ((now + quota.tick_ago_ns) % quota.tick_ns == 0) pass_on(s, server, quota);
@@ -54,10 +53,10 @@ void strike(S& s, Server& server, Quota& quota, i64 now) {
   }
 }
 
-// Lets the kernel look whether a quota is used up; the server's clock must be up to date.
+// Checks, as Linux does, whether a quota is used up; the server's clock must be up to date.
 //
-// What was overrun is a debt: a server that is stopped goes on when refills have paid it
-// (distribute_cfs_runtime); one that runs draws a slice (assign_cfs_rq_runtime), or stops.
+// Core time beyond the quota is a debt. A stopped server resumes when refills have paid the debt
+// (distribute_cfs_runtime); a running server draws a slice (assign_cfs_rq_runtime), or stops.
 template <class S>
 void notice(S& s, Server& server, Quota& quota, i64 now) {
   renew(s, server, quota, now);
@@ -73,7 +72,7 @@ void notice(S& s, Server& server, Quota& quota, i64 now) {
   set_speed(s, server);
 }
 
-// When something of the background wakes next, after now: a Poisson process.
+// Next instant after now at which a background thread wakes: a Poisson process.
 inline i64 next_wake(Quota& quota, i64 now) {
   while (quota.wakes_ns <= now) {
     const f64 drawn = attempt_uniform(quota.wake_key, quota.wakes++, 0);
@@ -83,23 +82,22 @@ inline i64 next_wake(Quota& quota, i64 now) {
   return quota.wakes_ns;
 }
 
-// When the quota of a busy server is looked at next.
-//
-// At the begin of a period if it is stopped, else at a tick or where the background wakes.
+// Instant of the next check of the quota of a busy server: for a stopped server the begin of a
+// period, else the next tick or wake of the background.
 template <class S>
 i64 next_look(S&, Server& server, Quota& quota, i64 now) {
   if (server.is_stopped) return (quota.period + 1) * quota.period_ns - quota.period_ago_ns;
-  if (quota.looks_ns == now) return now;  // the look of this instant has yet to come
+  if (quota.looks_ns == now) return now;  // the check of this instant is still pending
   const i64 tick_ns = now + quota.tick_ns - (now + quota.tick_ago_ns) % quota.tick_ns;
   return std::min(tick_ns, next_wake(quota, now));
 }
 
-// Mean core time that the threads of a server have received: where a new one begins.
+// Mean core time that the threads of a server have received; a new thread begins with it.
 template <class S>
 i64 average(const S& s, const Server& server, const Quota& quota) {
   const Waiting* waiting = waiting_of(s, server);
   i64 n = server.n_wait;
-  // Counted from one of them: 64 bits may not hold the sum.
+  // Subtract one of the ranks first: 64 bits may not hold the sum.
   const i64 origin = n > 0 ? waiting->rank : 0;
   i64 beyond = 0;
   for (i64 i = 0; i < n; ++i) beyond += waiting[i].rank - origin;
@@ -112,7 +110,7 @@ i64 average(const S& s, const Server& server, const Quota& quota) {
   return origin + beyond / n - down;
 }
 
-// Gives the turn, if nobody has it and the quota lets anybody, to who has received least.
+// Gives a free turn to the waiting thread that has received least, if the quota allows.
 template <class S>
 void take_turn(S& s, Server& server, i64 now) {
   Quota& quota = s.quotas[server.quota];
@@ -128,14 +126,15 @@ void take_turn(S& s, Server& server, i64 now) {
   set_speed(s, server);
 }
 
-// Replaces the foreign threads that take turns by so many new ones; the clock must be right.
+// Replaces the foreign threads that take turns by `threads` new threads; the clock must be up to
+// date.
 template <class S>
 void restress(S& s, Server& server, i64 threads) {
   Quota& quota = s.quotas[server.quota];
   const i64 received = average(s, server, quota);
   const i64 n = server.n_wait;
   server.n_wait = 0;
-  // The heap of the jobs grows no faster than that of all is read.
+  // In place: the heap of jobs never overtakes the row that is read.
   for (i64 i = 0; i < n; ++i) {
     const Waiting row = waiting_of(s, server)[i];
     if (row.key != kForeign) queue_up(s, server, row);
@@ -144,7 +143,7 @@ void restress(S& s, Server& server, i64 threads) {
   for (i64 i = 0; i < threads; ++i) queue_up(s, server, Waiting{received, kLate, kForeign, 0.0});
 }
 
-// Queues a job that a worker has taken for its turn; it begins with the mean.
+// Queues a job that a worker has taken for its turn; its core time starts at the mean.
 template <class S>
 void line_up(S& s, Server& server, const Job& job, i64 key, i64 work_ns, i64 now) {
   tick(s, server, now);

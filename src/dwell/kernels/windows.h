@@ -1,15 +1,15 @@
-// Windows: what resources had done when each opened and closed; and when the guard is woken.
+// Windows: the use of resources at the begin and end of each; and wakes of the guard.
 #pragma once
 
 #include "changes.h"
 
 namespace dwell {
 
-// Of what the core-nanoseconds of a resource are told: busy, the cell's own, its shadow's, and
-// those of other cells that have it, too, with their shadows.
+// Counters of core-nanoseconds per resource: busy, own jobs of the cell, its shadow's jobs, and
+// jobs of other cells that share the resource, with their shadows.
 constexpr i64 kParts = 4;
 
-// Core-nanoseconds of a server that all cells and their shadows have had up to now.
+// Core-nanoseconds of a server that all cells and their shadows have used up to now.
 template <class S>
 f64 of_all_cells(S& s, Server& server, i64 row) {
   const i64 n_resources = s.clock[0].n_resources;
@@ -33,8 +33,8 @@ f64 of_all_cells(S& s, Server& server, i64 row) {
   return sum;
 }
 
-// Writes the core-nanoseconds of a cell's resources up to now, in `kParts` parts.
-// Of an accelerator they are those of its places.
+// Writes the core-nanoseconds of a cell's resources up to now, in `kParts` parts; an accelerator
+// counts place-nanoseconds.
 template <class S>
 [[gnu::noinline]] void snapshot(S& s, f64* out, i64 cell, i64 now) {
   const Cell& of = s.cell(cell);
@@ -76,15 +76,15 @@ i64 snapshot_row(const S& s, i64 cell, i64 window) {
   return (cell * s.clock[0].n_windows + window) * kParts * s.clock[0].n_resources;
 }
 
-// Window that a cycle is the first of, as far as is known; -1 for none.
+// Window that begins with a cycle, as known so far; -1 for none.
 inline i64 opens(const Cell& cell, i64 cycle) {
   const i64 beyond = cycle - cell.close_cycle;
   if (beyond < 0) return cycle == cell.window_first ? cell.window : -1;
-  // The window before has not closed yet.
+  // The previous window has not ended yet.
   return beyond % cell.window_cycles == 0 ? cell.window + 1 + beyond / cell.window_cycles : -1;
 }
 
-// Place of a snapshot in `look_opened` and `look_shares`: `part` 0 since the last decision, 1 of
+// Place of a snapshot in `look_opened` and `look_shares`: `part` 0 since the last decision, 1 over
 // the cycles that a decision looks at.
 template <class S>
 i64 look_row(const S& s, i64 cell, i64 look, i64 part) {
@@ -97,13 +97,13 @@ i64 look_end_row(const S& s, i64 cell, i64 look) {
   return (cell * s.clock[0].n_looks + look) * kParts * s.clock[0].n_resources;
 }
 
-// Takes the snapshots of the decisions for which a cycle is the first one, if it is for any.
+// Takes the snapshots of all decisions whose cycles begin with this cycle.
 template <class S>
 [[gnu::noinline]] void open_looks(S& s, i64 cell, i64 cycle, i64 now) {
   const Cell& of = s.cell(cell);
   const i64 every = of.decide_cycles, age = cycle - of.since;
   if (age < 0) return;
-  // It begins the stretch up to a decision, and the W cycles that a decision looks at.
+  // The cycle may begin the stretch up to a decision, or the W cycles that a decision looks at.
   const i64 begun[] = {age, age + of.window_cycles - every};
   for (i64 part = 0; part < 2; ++part) {
     const i64 look = of.look_0 + begun[part] / every;
@@ -112,7 +112,7 @@ template <class S>
   }
 }
 
-// Opens the window that a cycle is the first of, if it is.
+// Opens the window that begins with a cycle, if any.
 template <class S>
 void open_window(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 window = opens(s.cell(cell), cycle);
@@ -121,12 +121,12 @@ void open_window(S& s, i64 cell, i64 cycle, i64 now) {
   }
 }
 
-// Close of the window that a cycle is the last of.
+// End of the window whose last cycle is `cycle`.
 inline i64 close_ns(const Cell& cell, i64 cycle) {
   return std::max(cell.release_ns[cycle + 1] + cell.grace_ns, cell.release_ns[cycle] + cell.due_ns);
 }
 
-// Announces a cell's next close; returns whether the cell waits for one, or migrates.
+// Announces the next end of a window of a cell; returns whether the cell waits for it, or migrates.
 template <class S>
 bool announce_close(S& s, i64 cell) {
   Cell& of = s.cell(cell);
@@ -137,7 +137,7 @@ bool announce_close(S& s, i64 cell) {
   return of.close_pending || of.migrating;
 }
 
-// Announces a cell's next decision, where these come more often than windows close.
+// Announces a cell's next decision, if decisions are more frequent than windows.
 template <class S>
 void announce_look(S& s, i64 cell) {
   Cell& of = s.cell(cell);
@@ -146,12 +146,13 @@ void announce_look(S& s, i64 cell) {
   s.post(close_ns(of, of.look_cycle - 1), make_key(kDecide, cell, of.look_cycle, 0));
 }
 
-// Whether the guard is woken now: no cycle from `waited` on has been heard to complete, or the one
-// after the newest that has is g periods old. If not, this is asked again when that cycle is.
+// Whether the guard wakes now: it has learnt of no completion from cycle `waited` on, or the cycle
+// after the newest known completion is g periods old. If not, the check is repeated when that cycle
+// is g periods old.
 template <class S>
 bool wakes_guard(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);
-  // It wants to be woken at another time instead.
+  // The guard has changed the time of its wake.
   if (of.wakes_ns != now) return false;
   of.wakes_ns = -1;
   const i64 waited = of.waited;

@@ -1,7 +1,7 @@
 #pragma once
 
-// Standard normals by the ziggurat of Marsaglia and Tsang (2000, DOI 10.18637/jss.v005.i08): those
-// that NumPy draws from the same stream, but that in the tail the last bit may be another.
+// Standard normals by the ziggurat of Marsaglia and Tsang (2000, DOI 10.18637/jss.v005.i08). They
+// equal NumPy's normals from the same stream, except that the last bit may differ in the tail.
 
 #include <array>
 #include <cstddef>
@@ -13,10 +13,10 @@
 
 namespace dwell {
 
-// Where the lowest layer ends and the tail begins.
+// Begin of the tail, which is the end of the lowest layer.
 constexpr double kTail = 3.6541528853610088;
 
-// Width of a step by the last 9 bits of a draw: the layer, and above it the sign.
+// Width of a step by the last 9 bits of a random number: the layer, and above it the sign.
 inline constexpr std::array<double, 512> kSignedStep = [] {
   std::array<double, 512> steps{};
   for (std::size_t layer = 0; layer < 256; ++layer) {
@@ -26,7 +26,8 @@ inline constexpr std::array<double, 512> kSignedStep = [] {
   return steps;
 }();
 
-// A normal beyond kTail, or its mirror image; `steps` are those of the draw that led here.
+// A normal beyond kTail, or below -kTail; bit 8 of `steps`, from the previous random number,
+// selects the sign.
 [[gnu::noinline]] inline double normal_in_tail(Sfc64& stream, uint64_t steps) noexcept {
   for (;;) {
     const double beyond = -(1.0 / kTail) * log(1.0 - stream.uniform());
@@ -51,7 +52,7 @@ inline void draw_normals(Sfc64& stream, double* normals, int64_t count) noexcept
     } else if (layer == 0) {
       normals[i++] = normal_in_tail(state, steps);
     } else {
-      // Where the layer sticks out of the density, a height decides whether x counts.
+      // Part of the layer is above the density: keep x if a random height is below the density.
       const double low = kDensity[layer];
       const double height = (kDensity[layer - 1] - low) * state.uniform() + low;
       i += height < exp(-0.5 * x * x);

@@ -47,7 +47,7 @@ def disturbed(scenario: Iterable[Disturbance], fabric: Fabric) -> list[Disturbed
             who, what = item.node, on_node(item)
             kind = f"{fabric.nodes[who].tier} {'outage' if item.down else 'stress'}"
         else:
-            who, what = "–".join(sorted((item.source, item.target))), _on_link(item)
+            who, what = "–".join(sorted((item.source, item.target))), on_link(item)
             kind = NETWORK
         together = round(begin_s, DIGITS), round(end_s, DIGITS), kind, what
         *_, mine = found.setdefault(together, (begin_s, end_s, []))
@@ -67,7 +67,8 @@ def on_node(item: NodeDisturbance) -> str:
     return f"{threads} busy thread{'' if threads == 1 else 's'}"
 
 
-def _on_link(item: LinkDisturbance) -> str:
+def on_link(item: LinkDisturbance) -> str:
+    """Describe the disturbance of a link, as ``+25 ms, loss 2 %``."""
     if item.down:
         return "down"
     parts = []

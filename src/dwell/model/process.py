@@ -134,17 +134,24 @@ class _ByMean:
         return self.mean
 
 
-@declared("lognormal")
-class LogNormal(_ByMean):
-    """Lognormal with the mean and coefficient of variation of the value itself, not of its log."""
+class _ByLogarithm(_ByMean):
+    """A process whose values have a normal logarithm."""
 
-    mean: float = key("Mean.", MEAN)
-    cv: float = key(SPREAD, CV)
+    __slots__ = ()
+    cv: float
 
     @property
     def log_parameters(self) -> tuple[float, float]:
         """Mean and standard deviation of the logarithm."""
         return _log_parameters(self.mean, self.cv)
+
+
+@declared("lognormal")
+class LogNormal(_ByLogarithm):
+    """Lognormal with the mean and coefficient of variation of the value itself, not of its log."""
+
+    mean: float = key("Mean.", MEAN)
+    cv: float = key(SPREAD, CV)
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values."""
@@ -182,7 +189,7 @@ class Exponential(_ByMean):
 
 
 @declared("ar1")
-class AR1(_ByMean):
+class AR1(_ByLogarithm):
     """Positive first-order autoregression: lognormal marginal, lag-1 correlation `rho`.
 
     The logarithm is a Gaussian AR(1) process. Its correlation r gives the *value* (not the
@@ -208,10 +215,7 @@ class AR1(_ByMean):
     @property
     def log_correlation(self) -> float:
         """Lag-1 correlation of the logarithm."""
-        if self.cv < 1e-8:  # the limit; below it, cv^2 leaves the floating-point numbers
-            return self.rho
-        square = self.cv * self.cv
-        return max(_log1p(self.rho * square) / _log1p(square), -1.0)
+        return _log_correlation(self.cv, self.rho)
 
     def marginal(self, rng: np.random.Generator, size: int) -> Floats:
         """Draw `size` independent values (without the memory)."""
@@ -222,6 +226,14 @@ class AR1(_ByMean):
 def _log_parameters(mean: float, cv: float) -> tuple[float, float]:
     variance = _log1p(cv * cv)
     return float(EXACT.ln(Decimal(mean))) - variance / 2, math.sqrt(variance)
+
+
+@lru_cache(maxsize=4096)
+def _log_correlation(cv: float, rho: float) -> float:
+    if cv < 1e-8:  # the limit; below it, cv^2 leaves the floating-point numbers
+        return rho
+    square = cv * cv
+    return max(_log1p(rho * square) / _log1p(square), -1.0)
 
 
 def _log1p(x: float) -> float:

@@ -93,13 +93,14 @@ _set_l95_ms, _set_violation_rate, _set_utilisation, _set_cut_from_ms, _set_error
 def unchecked_qos(
     l95_ms: float,
     violation_rate: float,
-    utilisation: FrozenDict[str, float],
+    utilisation: Mapping[str, float],
     cut_from_ms: float | None,
     error: tuple[float, float] | None = None,
 ) -> QoS:
     """Make a QoS without checks, in a third of the time.
 
-    The caller guarantees valid metrics; `cut_from_ms` must be None if it equals `l95_ms`.
+    The caller guarantees valid metrics and an immutable `utilisation`; `cut_from_ms` must be None
+    if it equals `l95_ms`.
     """
     qos: QoS = object.__new__(QoS)
     _set_l95_ms(qos, l95_ms)

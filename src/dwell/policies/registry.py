@@ -70,21 +70,21 @@ REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
         "atp": PolicyEntry(
             "dwell.policies.atp:ATP",
             "ATP",
-            "#e69f00",
+            "#998a4c",
             "ATP moves one task to the edge and back, if a threshold on L95 or utilisation is "
             "exceeded and the other side costs less latency, utilisation and switching.",
         ),
         "atp-thresholds": PolicyEntry(
             "dwell.policies.atp_thresholds:ATPThresholds",
             "ATP",
-            "#e69f00",
+            "#998a4c",
             variant_of="atp",
             estimates=False,
         ),
         "latency-first": PolicyEntry(
             "dwell.policies.latency_first:LatencyFirst",
             "Latency-first",
-            "#56b4e9",
+            "#007fff",
             "Latency-first takes the placement with the lowest estimated L95, always.",
         ),
         "work-function": PolicyEntry(
@@ -97,7 +97,7 @@ REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
         "cusum": PolicyEntry(
             "dwell.policies.cusum:Cusum",
             "CUSUM",
-            "#b8a800",
+            "#7f6040",
             "CUSUM adds up the savings of another placement over windows, and moves when the sum "
             "exceeds a threshold; it has no dwell time.",
         ),

@@ -17,6 +17,7 @@ from dwell.record.schema import (
     column_types,
     frame_of,
     row_of,
+    shown_reason,
 )
 from dwell.record.table_arrays import Names, TableArrays, arrays_of
 
@@ -48,4 +49,5 @@ __all__ = [
     "require_free",
     "row_of",
     "seal_run",
+    "shown_reason",
 ]

@@ -294,6 +294,6 @@ def how_many_are_whole(count: int, of: int) -> str:
 
 
 def listed(faults: Sequence[str]) -> list[str]:
-    """Return the first `LISTED` faults, and a line with the number of further ones."""
+    """Return the first `LISTED` faults, and a line with the number of further faults."""
     more = [f"and {len(faults) - LISTED} more"] if len(faults) > LISTED else []
     return [*faults[:LISTED], *more]

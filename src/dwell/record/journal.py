@@ -48,7 +48,8 @@ MAX_FRAME_BYTES = 1 << 28
 CHUNK_ROWS = 20_000
 
 
-def _frame(content: Mapping[str, object]) -> bytes:
+def framed(content: Mapping[str, object]) -> bytes:
+    """Return a frame of a journal."""
     text = json.dumps(content, separators=(",", ":"), default=_plain).encode("ascii")
     if len(text) > MAX_FRAME_BYTES:
         raise RunError(f"{len(text)} bytes of rows at once; the journal takes {MAX_FRAME_BYTES}")
@@ -293,7 +294,7 @@ def note_in_journal(folder: str | os.PathLike[str], **meta: object) -> None:
             end = _read(stream.read(), keep=False).end
             stream.truncate(end)
             stream.seek(end)
-            stream.write(_frame({"meta": meta}))
+            stream.write(framed({"meta": meta}))
     except OSError as error:
         raise RunError(f"{file}: cannot be written ({error.strerror})") from None
 
@@ -352,7 +353,7 @@ class Journal:
         # Encode the header before the file is created: an error must not leave half a journal.
         version = {"schema_version": SCHEMA_VERSION}
         header = {"run": run, **version, "meta": dict(meta), "columns": self.columns}
-        _frame({**header, "opened": 1})
+        framed({**header, "opened": 1})
         self._require_place()
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -364,7 +365,7 @@ class Journal:
             contents = self._go_on()
             self._following = contents.following
             self.meta: dict[str, Any] = {**contents.meta, **meta}
-            frame = _frame({**header, "opened": contents.opened + 1})
+            frame = framed({**header, "opened": contents.opened + 1})
             # Write the header twice: the second copy serves if the first is damaged.
             self._header = frame + frame if contents.opened == 0 else frame
             with suppress(UnwritableError):
@@ -464,7 +465,7 @@ class Journal:
         content: dict[str, object] = {"rows": {name: of for name, of in rows.items() if of}}
         if meta:
             content["meta"] = meta
-        self._write(_frame(content))
+        self._write(framed(content))
         self.meta.update(meta)
         for name in NUMBERED:
             for row in rows.get(name, ()):

@@ -1,4 +1,4 @@
-"""JSON documents: reading of files, and conversion of values to JSON-able ones."""
+"""JSON documents: reading of files, and conversion of values for JSON."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def read_document(file: Path) -> dict[str, Any]:
 
 
 def json_ready(value: Any) -> Any:
-    """Return a value for JSON: None for numbers that are not finite, text for paths."""
+    """Return a value for JSON; infinite numbers and NaN become None, paths become text."""
     if isinstance(value, Mapping):
         return {str(key): json_ready(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

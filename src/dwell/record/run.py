@@ -117,7 +117,7 @@ class Run(Displayed):
 
     @cached_property
     def played(self) -> Scenario | None:
-        """Disturbances applied to the run, from the first release on; None if not recorded.
+        """Disturbances applied to the run, from the first release on; None if unrecorded.
 
         If they are not recorded, the disturbances of the scenario apply.
 
@@ -149,7 +149,7 @@ class Run(Displayed):
 
     @property
     def disturbances(self) -> Scenario:
-        """Disturbances of nodes and links: the recorded ones, or else those in the scenario.
+        """Disturbances of nodes and links: as recorded, or else as in the scenario.
 
         Raises
         ------

@@ -38,9 +38,15 @@ REASON_SENTENCES: Mapping[Reason, str] = {
     "hold": "no other placement promised enough",
     "migrate": "another placement promised more than the least improvement",
     "capped": "the cheapest placement within the caps; a cheaper one was over a cap",
-    "infeasible": "every placement was over a cap, and those nearest to it were compared",
+    "infeasible": "all candidates are over a cap, this one least",
     "guard": "the robot moved by itself",
 }
+
+
+def shown_reason(reason: str) -> str:
+    """Return the reason of a decision as pages and the terminal show it."""
+    return REASON_SENTENCES["infeasible"] if reason == "infeasible" else reason
+
 
 #: Polars types and their names in JSON Schema; names become an enumeration.
 JSON_TYPES: Mapping[str, str] = {

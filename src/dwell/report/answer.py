@@ -62,7 +62,7 @@ def html_of(shown: object) -> str:
 
 
 def _answer(shown: object) -> Page:
-    """Return the page of a result with its first section only."""
+    """Return the page of a result with its first sections only."""
     if isinstance(shown, Problem):
         return _cell(shown)
     from dwell.record import Run
@@ -75,7 +75,8 @@ def _answer(shown: object) -> Page:
         case Run():
             return run_page(shown, sections=1)
         case Comparison():
-            return comparison_page(shown, sections=1)
+            # The third section counts scenarios under and over the aim.
+            return comparison_page(shown, sections=3)
         case StudyRuns():
             return study_page(shown, sections=1)
         case _:

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING
 
 from dwell.report.charts import Limit, curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure
 from dwell.report.page import Definitions, Fact, Page, Section
 from dwell.report.palette import CIRCLE, INK, SOLID, Style
-from dwell.report.table import Table, Text, interval_row
+from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text, interval_row
+from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
     from dwell.study.capacity import Capacity, CapacityPoint
     from dwell.study.what_ifs import WhatIf
 
-RATE = Measure("violation_rate", "V_D of the worst cell", "%", 100.0, decimals=2)
+RATE = METRICS["violation_rate"].called("V_D of the worst cell")
 
 
 def capacity_page(name: str, found: Capacity, what_ifs: Sequence[WhatIf] = ()) -> Page:
@@ -49,14 +49,13 @@ def written(found: Capacity) -> str:
 
 
 def answer(found: Capacity) -> str:
-    """Return numbers of robots by V_D: ``0 at ≤ 5 %; 9 [8, 9] at ≤ 10.3 % (one alone: 5.3 %)``."""
+    """Return numbers of robots by V_D: ``0 at ≤ 5 %; 9 [8, 9] at ≤ 10.31 % (one alone: …)``."""
     interval = "[{}, {}]".format(*found.interval)
     if found.limit_on == "violation_rate":
         return f"{written(found)} {interval}"
-    limit, bound = found.limit * 100, found.bound * 100
     return (
-        f"{found.robots_at_limit} at ≤ {limit:g} %; {written(found)} {interval} at ≤ {bound:.1f} % "
-        f"(one alone: {found.alone * 100:.1f} %)"
+        f"{found.robots_at_limit} at ≤ {found.limit * 100:g} %; {written(found)} {interval} at ≤ "
+        f"{RATE.text(found.bound)} (one alone: {RATE.text(found.alone)})"
     )
 
 
@@ -90,7 +89,7 @@ def _figure(found: Capacity) -> Figure:
     ends = ("mean", "low", "high")
     frame = pl.DataFrame(rows, schema=["policy", "at", *ends], orient="row")
     frame = frame.with_columns(pl.col(ends).fill_nan(None) * 100)
-    limit = Limit(found.bound * 100, f"limit: {found.bound * 100:.3g} %")
+    limit = Limit(found.bound * 100, f"limit: {RATE.text(found.bound)}")
     return Figure(
         "capacity",
         "V_D of the worst cell by number of robots",
@@ -115,7 +114,7 @@ def _changes(found: Capacity, what_ifs: Sequence[WhatIf]) -> Table:
         Text("robots", "robots"),
         Text("interval", "95 % interval"),
     ]
-    return Table("changes", "Robots after a change", columns, rows)
+    return Table("changes", "Robots after a change", columns, rows, caption=WITHOUT_WARMUP)
 
 
 def _numbers(found: Capacity) -> Table:
@@ -127,8 +126,8 @@ def _numbers(found: Capacity) -> Table:
         }
         for point in found.curve
     ]
-    columns: list[Text | Measure] = [Text("robots", "robots"), RATE, Text("used", "utilisation")]
-    return Table("curve", "V_D by number of robots", columns, rows)
+    columns: Columns = [Text("robots", "robots"), RATE, Text("used", "utilisation")]
+    return Table("curve", "V_D by number of robots", columns, rows, caption=WITHOUT_WARMUP)
 
 
 def errors(found: Capacity) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,7 +20,7 @@ from dwell.report.palette import INK, MUTED, PARTS, Style
 if TYPE_CHECKING:
     import polars as pl
 
-    from dwell.report.formatting import Measure
+    from dwell.display import Measure
 
 #: Names of the parts of a latency, and their colours by name.
 PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
@@ -36,6 +37,8 @@ MOST_LINES = 20
 SYMBOL_PX, LETTER_PX = 34, 6.2
 #: Smallest share of cycles on the axis of a distribution.
 LEAST_SHARE = 1e-4
+#: Outline of bars, whose fills may have little contrast with the paper.
+OUTLINE: dict[str, Any] = {"stroke": MUTED, "strokeWidth": 0.6}
 #: Vega tests of a row: its policy is chosen by the reader; its interval is known.
 CHOSEN = "indexof(policies, datum.policy) >= 0"
 BOUNDED = "isValid(datum.low) && isValid(datum.high)"
@@ -54,6 +57,12 @@ NO_LIMIT = Limit(math.inf, "")
 def quantity(field: str, title: str | None, **more: Any) -> Spec:
     """Return the encoding of a number; `more` are properties of Vega-Lite, such as ``scale``."""
     return {"field": field, "type": "quantitative", "title": title, **more}
+
+
+def number_of(field: str, measure: Measure) -> Spec:
+    """Return the encoding of a measure in a tooltip; `field` is in the shown unit."""
+    more = {"format": f".{measure.decimals}f"} if measure.fixed else {}
+    return quantity(field, measure.heading, **more)
 
 
 def name_of(field: str, **more: Any) -> Spec:
@@ -134,14 +143,20 @@ def limit_rule(axis: str, limit: float, name: str, **style: Any) -> list[Spec]:
 
 
 def square(
-    side: float, across: Spec, up: Spec, limit: Limit, beneath: Spec, marks: Mapping[str, Any]
+    side: float,
+    across: Spec,
+    up: Spec,
+    limits: Sequence[Limit],
+    beneath: Spec,
+    marks: Mapping[str, Any],
 ) -> Spec:
-    """Return a square panel with the same quantity, and the same limit, on both axes.
+    """Return a square panel with the same quantity on both axes, and a limit for each.
 
     `beneath` is a layer below the marks, with its data; `marks` is a group of layers over the
     chart's rows, without the encodings of the two axes.
     """
-    rules = [rule for axis in ("x", "y") for rule in limit_rule(axis, *limit)]
+    axes = zip(("x", "y"), limits, strict=True)
+    rules = [rule for axis, limit in axes for rule in limit_rule(axis, *limit)]
     encoding = {"x": across, "y": up, **marks["encoding"]}
     group = {"data": {"name": "rows"}, **marks, "encoding": encoding}
     return {"width": side, "height": side, "layer": [beneath, *rules, group]}
@@ -188,7 +203,7 @@ def intervals(
     seed = {
         "x": "value",
         "opacity": {"condition": {"test": "seed === datum.seed", "value": 1}, "value": 0.22},
-        "tooltip": [*about, quantity("seed", "seed"), quantity("value", measure.heading)],
+        "tooltip": [*about, quantity("seed", "seed"), number_of("value", measure)],
     }
     mean = {"shape": colours["shape"], "tooltip": [*about, *_mean_and_ends(measure)]}
     marks = [
@@ -219,7 +234,8 @@ def stacked(
         "color": coloured("part", parts, legend={"symbolType": "square"}),
         "tooltip": [*names("policy", "part"), quantity("value", heading)],
     }
-    bars = in_order(layer("bar", encoding, where=[CHOSEN], height={"band": 0.7}), parts)
+    bars = layer("bar", encoding, where=[CHOSEN], height={"band": 0.7}, **OUTLINE)
+    bars = in_order(bars, parts)
     return _panels(frame, policies, lambda _: [bars, *limit_rule("x", *limit)])
 
 
@@ -246,7 +262,9 @@ def distributions(frame: pl.DataFrame, styles: Mapping[str, Style], deadline_ms:
         scale={"type": "log", "domain": [LEAST_SHARE, 1], "clamp": True},
         axis={"values": [1, 0.1, 0.01, 0.001, LEAST_SHARE], "format": "~%"},
     )
-    across = quantity("latency_ms", "latency (ms)", axis={"tickCount": 5})
+    # Without any finished cycle the axis has no values of its own.
+    scale = {"domain": [0, 2 * deadline_ms]} if frame.is_empty() else {}
+    across = quantity("latency_ms", "latency (ms)", scale=scale, axis={"tickCount": 5})
     rules = [
         *limit_rule("x", deadline_ms, "deadline"),
         *limit_rule("y", 0.05, "5 %", color=MUTED, strokeDash=[1, 3]),
@@ -344,11 +362,26 @@ def curves(
 
 
 def _mean_and_ends(measure: Measure) -> list[Spec]:
-    return [quantity("mean", measure.heading), quantity("low", "from"), quantity("high", "to")]
+    ends = (measure.called(name) for name in ("from", "to"))
+    return [number_of("mean", measure), *map(number_of, ("low", "high"), ends)]
 
 
 def _of(look: Mapping[str, Spec], *channels: str) -> dict[str, Spec]:
     return {channel: look[channel] for channel in channels}
+
+
+def _with_short_title(layers: Spec, width: float) -> Spec:
+    """Return a layer, or a group, whose title of the axis of values has lines of a panel's width.
+
+    Titles of neighbouring panels would overlap otherwise.
+    """
+    encoding = layers.get("encoding", {})
+    title = encoding.get("x", {}).get("title")
+    if not isinstance(title, str):
+        return layers
+    lines = textwrap.wrap(title, max(int(width / LETTER_PX), 8)) or [""]
+    short = lines[0] if len(lines) == 1 else lines
+    return {**layers, "encoding": {**encoding, "x": {**encoding["x"], "title": short}}}
 
 
 def _panels(
@@ -387,7 +420,8 @@ def _panels(
         height_px = ROW_PX * max(len(policies), 1)
         if tallest_px is not None:
             height_px = min(tallest_px, round(0.6 * across_px))
-        spec: Spec = {"width": across_px, "height": height_px, "layer": layers(width)}
+        drawn = [_with_short_title(one, across_px) for one in layers(width)]
+        spec: Spec = {"width": across_px, "height": height_px, "layer": drawn}
         if len(facets) > 1:
             header = {"labelLimit": across_px + GAP_PX, "labelExpr": "split(datum.value, '\\n')"}
             spec = {

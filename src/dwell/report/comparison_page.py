@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 
+from dwell.display import Measure
 from dwell.model.bounds import counted
 from dwell.model.disturbed import disturbed
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
-    COST,
-    Measure,
     few_seeds,
     independent_runs,
     shown_policy,
@@ -18,11 +18,12 @@ from dwell.report.formatting import (
 )
 from dwell.report.method import numbered
 from dwell.report.page import Page, Section, page_html
-from dwell.report.policy_blocks import PolicyBlocks
-from dwell.report.table import Columns, Table, Text, table_text, wrapped
+from dwell.report.policy_blocks import MOST_COLUMNS, PolicyBlocks
+from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text, table_text, wrapped
 from dwell.report.timeline import begins_by_number, run_timeline
 from dwell.study import Comparison, paper_predictions
 from dwell.study.drawn_disturbances import drawn_disturbances
+from dwell.study.metric import METRICS
 
 DTP = "dtp"
 
@@ -54,7 +55,7 @@ def comparison_page(*comparisons: Comparison, sections: int | None = None) -> Pa
         policies |= blocks.colours
         for part in islice(_sections(comparison, blocks), sections):
             title = f"{comparison.problem.name}: {part.title}" if several else part.title
-            parts.append(Section(title.removesuffix(": "), part.blocks, part.note))
+            parts.append(replace(part, title=title.removesuffix(": ")))
     first = comparisons[0]
     runs = sum(one.runs.height for one in comparisons)
     cells = ", ".join(one.problem.name for one in comparisons)
@@ -70,17 +71,22 @@ def comparison_page(*comparisons: Comparison, sections: int | None = None) -> Pa
 
 
 def _sections(comparison: Comparison, blocks: PolicyBlocks) -> Iterator[Section]:
-    yield Section("", blocks.answer(), note=blocks.headline())
+    yield Section("", [blocks.rate()], note=blocks.headline())
+    yield Section("The cell and its placements", blocks.cell())
+    yield Section("Scenarios under and over the aim", [blocks.counts()], folded=True)
     predictions = predictions_table(comparison, blocks)
     if predictions.rows:
-        yield Section("What the paper predicts", [predictions])
-    yield Section("Results", [blocks.results()])
-    figures = [blocks.tail(), blocks.measure(COST, title="J, the cost that DTP seeks to lower")]
+        yield Section("Predictions of the paper", [predictions], folded=True)
+    yield Section("Results", blocks.results().parts(MOST_COLUMNS), folded=True)
+    figures = [
+        blocks.tail(),
+        blocks.measure(METRICS["cost"], title="J, the cost that DTP seeks to lower"),
+    ]
     figures += [blocks.distribution(), *blocks.placed(), blocks.split()]
-    yield Section("Figures", figures)
+    yield Section("Figures", figures, folded=True)
     moving = [name for name in comparison.policies if name not in comparison.statics]
     if moving and comparison.examples:
-        shown = DTP if DTP in moving else moving[0]
+        shown = next(name for name in (DTP, DTP.upper(), *moving) if name in moving)
         timelines = [_timeline(comparison, blocks, one, shown) for one in comparison.scenarios]
         yield Section(
             f"{shown_policy(shown)} through time",
@@ -88,16 +94,18 @@ def _sections(comparison: Comparison, blocks: PolicyBlocks) -> Iterator[Section]
             note=f"Runs of seed {comparison.seeds[0]}. Marks are windows, or as many of them as "
             "the axis says; thin lines J of the other placements as estimated, upright lines "
             "migrations. Shaded: warm-up and disturbances.",
+            folded=True,
         )
-        yield Section("What was estimated, and what was measured", [_beliefs(comparison, blocks)])
-    yield Section("More numbers", [blocks.more()])
+        beliefs = [_beliefs(comparison, blocks)]
+        yield Section("Estimated J and measured J", beliefs, folded=True)
+    yield Section("More numbers", blocks.more().parts(MOST_COLUMNS), folded=True)
     method = blocks.method(
         runs=f"{counted(comparison.windows, 'window')}, {numbered(comparison.seeds)}; every policy "
         "plays the same realisation of a scenario and seed",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own; "
         f"of medians, by order statistics.{independent_runs(comparison.runs)}",
     )
-    yield Section("How it was made", method)
+    yield Section("Method", method, folded=True)
 
 
 def predictions_table(comparison: Comparison, blocks: PolicyBlocks) -> Table:
@@ -152,12 +160,13 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
     rows = means.filter(~pl.col("policy").is_in(list(comparison.problem.candidates))).join(
         alone.rename({"policy": "candidate"}), on=["scenario", "candidate"], how="left"
     )
+    cost = METRICS["cost"]
     columns: Columns = [
         Text("policy", "policy", "policy"),
         Text("candidate", "placement", "placement"),
-        Measure("estimated", "estimated while idle", decimals=2),
-        Measure("measured", "measured while active", decimals=2),
-        Measure("alone", "measured alone", decimals=2),
+        cost.called("estimated while idle", "estimated"),
+        cost.called("measured while active", "measured"),
+        cost.called("measured alone", "alone"),
         Measure("shadow_fraction", "shadows per alternative", "%", 100.0, 1),
     ]
     return Table(
@@ -167,7 +176,7 @@ def _beliefs(comparison: Comparison, blocks: PolicyBlocks) -> Table:
         rows.to_dicts(),
         Text("scenario", "", "scenario"),
         "Estimates include the cost of switching. Alone: of the static placement, on the same "
-        "realisations.",
+        f"realisations. {WITHOUT_WARMUP}",
         blocks.palette,
     )
 

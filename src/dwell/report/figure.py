@@ -10,7 +10,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from dwell.files import write_whole
+from dwell.report.formatting import SYMBOL
 from dwell.report.palette import PRINTED
 
 if TYPE_CHECKING:
@@ -41,7 +42,8 @@ class Figure:
     """A figure.
 
     `slug` is its name in files and links, unique in a page. `frames` has the data by their names
-    in the drawing. `caption` is plain text.
+    in the drawing. `caption` is plain text. A figure with `widths`, in pixels, has one
+    picture per width; the page shows the widest picture that fits, and no script redraws it.
     """
 
     slug: str
@@ -49,6 +51,7 @@ class Figure:
     frames: Mapping[str, pl.DataFrame]
     draw: Draw
     caption: str = ""
+    widths: Sequence[float] = ()
 
     def spec(self, width: float = PAGE_PX, *, letters: float = LETTERS_PX) -> Spec:
         """Return the drawing with its data and style; lengths and letters in pixels."""
@@ -74,11 +77,12 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def svg(figure: Figure) -> str:
-    """Return the SVG element of a figure for a page."""
+def svg(figure: Figure, width: float | None = None) -> str:
+    """Return the SVG element of a figure for a page, or for a part of it that is `width` wide."""
     import vl_convert
 
-    text = vl_convert.vegalite_to_svg(figure.spec())
+    text = vl_convert.vegalite_to_svg(figure.spec(width or (*figure.widths, PAGE_PX)[0]))
+    text = _typeset(text)
     # vl-convert resolves links within the page against a site of Vega; restore them.
     text = text.replace("https://vega.github.io/vega-datasets/#", "#")
     # Two decimals and no ARIA attributes keep a page with many figures small.
@@ -87,10 +91,11 @@ def svg(figure: Figure) -> str:
     # vl-convert numbers ids across drawings; ids by slug do not depend on earlier drawings.
     names = list(dict.fromkeys(re.findall(r'id="(\w+)"', text)))
     for place, name in enumerate(names):
-        text = re.sub(rf"\b{name}\b", f"{figure.slug}-{place}", text)
+        own = figure.slug if width is None else f"{figure.slug}-{width:.0f}"
+        text = re.sub(rf"\b{name}\b", f"{own}-{place}", text)
     label = escape(figure.title)
-    width = re.search(r'width="([\d.]+)"', text)
-    most = "" if width is None else f' style="max-width:{float(width[1]):.0f}px"'
+    whole = re.search(r'width="([\d.]+)"', text)
+    most = "" if whole is None else f' style="max-width:{float(whole[1]):.0f}px"'
     return re.sub(
         r'<svg ([^>]*?)width="[^"]*" height="[^"]*"',
         rf'<svg role="img" aria-label="{label}"{most} \1',
@@ -99,14 +104,25 @@ def svg(figure: Figure) -> str:
     )
 
 
+def _typeset(drawing: str) -> str:
+    """Lower the indices of symbols in the texts of an SVG: V_D."""
+    # `dy` is in letters of its own element, and lasts; the letter after an index ends it.
+    lowered = r'\1<tspan dy=".3em" font-size="75%">\2</tspan><tspan dy="-.225em">\3</tspan>'
+    return re.sub(
+        r"(?<=>)[^<>]+(?=</text>)",
+        lambda text: re.sub(f"{SYMBOL.pattern}(.?)", lowered, text[0]),
+        drawing,
+    )
+
+
 def printed_svg(figure: Figure, width_pt: float = COLUMN_PT) -> str:
     """Return a figure as an SVG document for a column of a paper, with text of 7 pt."""
-    import vl_convert
-
-    text = str(vl_convert.vegalite_to_svg(_printed(figure, width_pt)))
     # One unit of the drawing is one point.
     return re.sub(
-        r'width="([\d.]+)" height="([\d.]+)"', r'width="\1pt" height="\2pt"', text, count=1
+        r'width="([\d.]+)" height="([\d.]+)"',
+        r'width="\1pt" height="\2pt"',
+        _printed(figure, width_pt),
+        count=1,
     )
 
 
@@ -114,24 +130,24 @@ def pdf(figure: Figure, width_pt: float = COLUMN_PT) -> bytes:
     """Return a figure as PDF for a column of a paper, with text of 7 pt."""
     import vl_convert
 
-    return bytes(vl_convert.vegalite_to_pdf(_printed(figure, width_pt)))
+    return bytes(vl_convert.svg_to_pdf(_printed(figure, width_pt)))
 
 
-def _printed(figure: Figure, width_pt: float) -> Spec:
-    """Return the drawing whose total width, with axes, is `width_pt`, within 1 pt if possible."""
+def _printed(figure: Figure, width_pt: float) -> str:
+    """Return the SVG whose total width, with axes, is `width_pt`, within 1 pt if possible."""
     import vl_convert
 
-    asked = width_pt
-    spec: Spec = {}
+    asked, text = width_pt, ""
     for _ in range(4):
         drawn = figure.spec(asked, letters=LETTERS_PT)
-        spec = _resolved({**drawn, "background": "white"})
-        found = re.search(r'width="([\d.]+)"', vl_convert.vegalite_to_svg(spec))
+        text = vl_convert.vegalite_to_svg(_resolved({**drawn, "background": "white"}))
+        found = re.search(r'width="([\d.]+)"', text)
         off = width_pt - (width_pt if found is None else float(found[1]))
         if 0 <= off < 1:
             break
         asked += off - 0.5
-    return spec
+    # Links lead to places of a page, which a printed figure leaves.
+    return _typeset(re.sub(r"</?a\b[^>]*>", "", text))
 
 
 def _resolved(drawing: Spec) -> Spec:

@@ -6,29 +6,40 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from dwell.display import Measure, write_number
 from dwell.errors import SimulationError
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
+from dwell.model.table_columns import SHARE_OF
 from dwell.report.capacity_page import PHASES
 from dwell.report.charts import coloured, disc, layer, name_of, names, quantity
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import COST, L95, RATE, Measure, percent, write_ms, write_number
+from dwell.report.formatting import percent, write_ms
 from dwell.report.page import Definitions, Fact, Page, Section
 from dwell.report.palette import INK, MUTED, Palette
-from dwell.report.table import MOST_ROWS, Columns, Table, Text
-from dwell.report.timeline import fleet_timeline, rows_px
+from dwell.report.table import MOST_ROWS, WITH_WARMUP, WITHOUT_WARMUP, Columns, Table, Text
+from dwell.report.timeline import FAR, fleet_timeline, rows_px
+from dwell.report.topology import topology
 from dwell.study import AIM
 from dwell.study.fleet_summary import fleet_numbers, refusals
+from dwell.study.metric import METRICS, metric_of
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from dwell.record import FleetRun
 
-MOVES = Measure("moves", "moves", decimals=0)
+#: Metrics of a cell.
+RATE, L95, COST = (METRICS[name] for name in ("violation_rate", "l95_ms", "cost"))
 #: Room next to the panels of cells, and between them, pixels.
 BESIDE_PX, GAP_PX = 120, 18
 ROUNDS_PX = 190
 #: Largest number of cells for which the table of cells is open.
 UNFOLDED = 24
+#: Most outliers that are named.
+MOST_NAMED = 5
 #: Target of a move in figures if the cell stays.
 STAYS = "no move"
 
@@ -81,9 +92,9 @@ class _FleetPage:
     def _facts(self) -> Iterator[Fact]:
         worst, numbers = self.cells[0], self.numbers
         kept = sum(row["verdict"] == "kept" for row in self.cells)
-        yield Fact("V_D of the worst cell", percent(worst["violation_rate"], 1), worst["cell"])
+        yield Fact("V_D of the worst cell", RATE.text(worst["violation_rate"]), worst["cell"])
         yield Fact("cells that keep the aim", f"{kept}", f"of {len(self.cells)}; under 5 %")
-        yield Fact("J", write_number(numbers["cost"], 2), "mean over cells")
+        yield Fact("J", COST.text(numbers["cost"]), "mean over cells")
         most = max(row["moves"] for row in self.cells)
         yield Fact("moves", write_number(numbers["moves"], 0), f"at most {most} of a cell")
         if self.run.guard:
@@ -94,6 +105,7 @@ class _FleetPage:
     def _sections(self) -> Iterator[Section]:
         yield Section("", [self._time()])
         yield Section("Cells, the worst first", [self._drawn_cells()])
+        yield Section("Topology", list(self._topologies()))
         yield Section("Cells in numbers", [self._table()], folded=len(self.cells) > UNFOLDED)
         if self.numbers["rounds"]:
             yield Section("Rounds of the ledger", self._rounds())
@@ -111,12 +123,21 @@ class _FleetPage:
             colours=self.used,
             disturbed=self._disturbed(),
             caption=(
-                "A row is a cell, the worst first, in the colour of where it is. V_D: mean over "
-                "cells, and from the least to the most. Dashed: the aim of 5 %. U: all load of a "
-                "shared node, foreign work included. Upright lines: moves; in colour, a guard's. "
-                "Shaded: warm-up and disturbances."
+                "A row is a cell, the worst first, in the colour of its placement. V_D: median and "
+                f"quartiles of the cells; circles: outliers{self._outliers()}. Dashed: the aim of "
+                "5 %. U: all load of a shared node, foreign work included. Upright lines: moves; "
+                "in colour, a guard's. Shaded: warm-up and disturbances."
             ),
         )
+
+    def _outliers(self) -> str:
+        """Return the names of the cells far above the others in V_D of the whole run."""
+        rates = np.array([row["violation_rate"] for row in self.cells])
+        low, high = np.quantile(rates, (0.25, 0.75))
+        far = [
+            row["cell"] for row in self.cells if row["violation_rate"] > high + FAR * (high - low)
+        ]
+        return f"; in the whole run {', '.join(far[:MOST_NAMED])}" if far else ""
 
     def _disturbed(self) -> list[Disturbed]:
         """Return the disturbances of cells, with the number of cells unless all have them."""
@@ -144,6 +165,8 @@ class _FleetPage:
                 "measure": measure.heading,
                 "value": row[measure.column] * measure.factor,
                 "limit": limits[measure].get(row["cell"]),
+                # An axis needs a value in every panel.
+                "at": limits[measure].get(row["cell"], row[measure.column] * measure.factor),
             }
             for measure in limits
             for row in self.cells
@@ -156,6 +179,17 @@ class _FleetPage:
             "Means over the windows after the warm-up. Dashed: the aim of 5 %, and the deadline.",
         )
 
+    def _topologies(self) -> Iterator[Figure]:
+        """Yield one drawing per entry: its cells are alike."""
+        fleet = self.run.fleet
+        shared = f" All cells share {', '.join(fleet.shared)}." if fleet.shared else ""
+        for place, entry in enumerate(fleet.entries):
+            yield topology(
+                entry.cell,
+                f"topology-{place}",
+                f"{counted(entry.count, 'cell')} of this kind.{shared}",
+            )
+
     def _table(self) -> Table:
         import polars as pl
 
@@ -166,23 +200,29 @@ class _FleetPage:
             cell = row["cell"]
             spent = {name: at.get((cell, name), 0) for name in self.used}
             windows = sum(spent.values())
-            shares = {f"share {name}": count / windows for name, count in spent.items()}
+            shares = {
+                SHARE_OF.format(candidate=name): count / windows for name, count in spent.items()
+            }
             rows.append({**row, **shares, "page": self.links.get(cell, "")})
         columns: Columns = [
             Text("cell", "cell", "cell", "{page}"),
-            RATE._replace(decimals=2),
+            RATE,
             Text("verdict", "verdict", "word"),
             L95,
             COST,
-            MOVES,
-            *(Measure(f"share {name}", name, "%", 100.0, 0) for name in self.used),
+            Measure("moves", "moves"),
+            *(metric_of(SHARE_OF.format(candidate=name)) for name in self.used),
         ]
-        caption = "L95 as seen at the windows’ closes. Last columns: share of windows by placement."
+        caption = (
+            "L95 as seen at the windows’ closes. Last columns: share of windows by placement. "
+            f"{WITHOUT_WARMUP}"
+        )
         return Table("cell-table", "", columns, rows, caption=caption, palette=self.palette)
 
     # ------------------------------------------------------------------------------- rounds
 
-    def _rounds(self) -> list[Figure | Table]:
+    def _closes(self) -> pl.DataFrame:
+        """Return the end of each cell's windows, ``at``, in s."""
         import polars as pl
 
         cycles = pl.DataFrame(
@@ -191,12 +231,16 @@ class _FleetPage:
                 for name, one in self.problems.items()
             ]
         )
-        closes = self.run.windows.join(cycles, on="cell").select(
+        return self.run.windows.join(cycles, on="cell").select(
             "cell", "window", at=(pl.col("first_cycle") + pl.col("each")) * pl.col("period")
         )
+
+    def _rounds(self) -> list[Figure | Table]:
+        import polars as pl
+
         asked = (
             self.run.decisions.filter(pl.col("phi_before").is_not_null())
-            .join(closes, on=["cell", "window"], how="left")
+            .join(self._closes(), on=["cell", "window"], how="left")
             .sort("round")
             .select(
                 "round",
@@ -240,6 +284,7 @@ class _FleetPage:
                 f"{asked['round'].n_unique()} played)",
                 columns,
                 rows,
+                caption=WITH_WARMUP,
                 palette=self.palette,
             ),
         ]
@@ -252,10 +297,11 @@ class _FleetPage:
         columns: Columns = [
             Text("reason", "reason"),
             Text("to", "to", "placement"),
-            Measure("count", "refusals", decimals=0),
+            Measure("count", "refusals"),
         ]
         caption = (
-            "Moves that a policy had decided on and coordination did not allow, by its closes."
+            "Moves that a policy had decided on and coordination did not allow, by its closes. "
+            f"{WITH_WARMUP}"
         )
         return Table("refused", "", columns, rows, caption=caption, palette=self.palette)
 
@@ -291,7 +337,8 @@ def _dots(cells: Sequence[str], headings: Sequence[str], width: float) -> Spec:
         "y": name_of("cell", sort=list(cells), axis={"labelOverlap": True}),
         "tooltip": [*names("cell", "measure"), *(quantity(one, one) for one in ("value", "limit"))],
     }
-    limit = {**where, "x": quantity("limit", None)}
+    shown = {"condition": {"test": "isValid(datum.limit)", "value": 1}, "value": 0}
+    limit = {**where, "x": quantity("at", None), "opacity": shown}
     return {
         "data": {"name": "rows"},
         "facet": name_of("measure", sort=list(headings)),
@@ -318,7 +365,7 @@ def _phi(colours: Mapping[str, str], width: float) -> Spec:
         quantity("phi_before", "Φ before"),
         quantity("phi_after", "Φ after"),
     ]
-    axis = {"tickMinStep": 1, "format": "d", "grid": False}
+    axis = {"tickMinStep": 1, "tickCount": 10, "format": "d", "grid": False}
     scale = {"nice": False, "padding": 8}
     up = quantity("phi_before", "Φ", scale={"zero": False}, axis={"tickCount": 5})
     return {

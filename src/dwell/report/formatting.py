@@ -7,9 +7,10 @@ import re
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, NamedTuple
 
-from dwell.display import decimals_for
+from dwell.display import Measure, decimals_for, write_number, write_places
 from dwell.report.palette import FAMILIES, contended
 from dwell.study import Interval
+from dwell.study.metric import METRICS
 from dwell.study.over_seeds import RUN, UNIT
 
 if TYPE_CHECKING:
@@ -26,65 +27,9 @@ LASTING = (
 )
 #: A symbol with its index: V_D, N_min, α_L.
 SYMBOL = re.compile(r"(?<![\w.])([A-ZΔα-ωdp])_(D|L|V|S|r|e|z|min|max|loss)(?!\w)")
-ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}
-
-
-class Measure(NamedTuple):
-    """Format of a column.
-
-    Parameters
-    ----------
-    column : str
-        Key of the rows; for many runs a column of ``Comparison.runs``.
-    name : str
-        Heading without the unit.
-    unit : str
-        Unit after the name; empty for numbers without a unit.
-    factor : float
-        Factor from the column's unit to the shown unit.
-    ends : bool
-        Whether the interval is always written as ``[low, high]``.
-    signed : bool
-        Whether positive numbers have a plus sign.
-    """
-
-    column: str
-    name: str
-    unit: str = ""
-    factor: float = 1.0
-    decimals: int = 1
-    ends: bool = False
-    signed: bool = False
-
-    @property
-    def heading(self) -> str:
-        """The name with its unit: ``L95 (ms)``."""
-        return f"{self.name} ({self.unit})" if self.unit else self.name
-
-    def for_size(self, *values: float) -> Measure:
-        """Return the measure with enough decimals for the largest of these numbers.
-
-        Only times get more decimals, if all of them would be rounded to 0.
-        """
-        size = max((abs(value) for value in values if math.isfinite(value)), default=0.0)
-        if self.unit not in ("ms", "s") or size >= 10.0**-self.decimals:
-            return self
-        return self._replace(decimals=decimals_for(size, self.decimals))
-
-
-RATE = Measure("violation_rate", "V_D", "%", 100.0)
-L95 = Measure("l95_ms", "L95", "ms")
 #: L95 of the final latencies of cycles.
-FINAL_L95 = L95._replace(name="L95 final")
-COST = Measure("cost", "J", decimals=2)
-MIGRATIONS = Measure("migrations", "migrations")
-REGRET = Measure("regret", "regret", "%", 100.0)
-ORACLE_REGRET = Measure("oracle_regret", "over oracle", "%", 100.0)
-
-
-def own_measures(metrics: Iterable[str]) -> list[Measure]:
-    """Return the measures of a user's own metrics, without units."""
-    return [Measure(name, name, decimals=2) for name in metrics]
+FINAL_L95 = METRICS["l95_ms"].called("L95 final")
+ABBREVIATIONS = {"cpu": "CPU", "gpu": "GPU", "lan": "LAN", "wan": "WAN", "5g": "5G"}
 
 
 class Written(NamedTuple):
@@ -96,19 +41,6 @@ class Written(NamedTuple):
     def __str__(self) -> str:
         """Return ``3.4 ± 0.2``."""
         return f"{self.value} {self.error}".strip()
-
-
-def write_number(value: float, decimals: int = 1, *, signed: bool = False) -> str:
-    """Write a number with `decimals` decimals, or fewer if that makes more than three digits.
-
-    Thin spaces separate thousands; infinity is ∞; NaN is a dash.
-    """
-    if math.isnan(value):
-        return "–"
-    plus = "+" if signed and value > 0 else ""
-    if math.isinf(value):
-        return f"{plus}∞" if value > 0 else "−∞"
-    return plus + _fixed(value, _places(value, decimals))
 
 
 def write_ms(value: float) -> str:
@@ -129,21 +61,21 @@ def write_interval(interval: Interval, measure: Measure, *, larger_half: bool = 
         Whether to write ``±`` and the larger half for every finite interval: for narrow tables that
         explain it.
     """
+    text = measure.number(interval.value)
     value, low, high = (end * measure.factor for end in interval)
-    text = write_number(value, measure.decimals, signed=measure.signed) if value else "0"
     if not interval.known or low == high:
         return Written(text, "")
     half = max(high - value, value - low)
     if measure.ends or not math.isfinite(half):
         return Written(text, _between(low, high, measure))
-    places = _places(value, measure.decimals)
+    places = measure.places(value)
     least = 10.0**-places
     small = half < least / 2
     if not (larger_half or small or _is_even(value, low, high, least)):
         return Written(text, _between(low, high, measure))
     if small:
-        return Written(text, f"± <{_fixed(least, places)}")
-    return Written(text, f"± {_fixed(half, places)}")
+        return Written(text, f"± <{write_places(least, places)}")
+    return Written(text, f"± {write_places(half, places)}")
 
 
 def _is_even(value: float, low: float, high: float, least: float) -> bool:
@@ -155,19 +87,11 @@ def _is_even(value: float, low: float, high: float, least: float) -> bool:
     return alike and (value - half < 0) == (low < 0) and (value + half > 0) == (high > 0)
 
 
-def _places(value: float, decimals: int) -> int:
-    """Return the number of decimals for three digits in total, at most `decimals`."""
-    whole = 1 + math.floor(math.log10(abs(value))) if value else 1
-    return max(0, min(decimals, 3 - whole))
-
-
-def _fixed(value: float, places: int) -> str:
-    # Adding 0.0 turns -0.0 into 0.0.
-    return f"{round(value, places) + 0.0:,.{places}f}".replace(",", "\u2009").replace("-", "−")
-
-
 def _between(low: float, high: float, measure: Measure) -> str:
-    ends = (write_number(end, measure.decimals, signed=measure.signed) for end in (low, high))
+    ends = (
+        write_number(end, measure.decimals, signed=measure.signed, fixed=measure.fixed)
+        for end in (low, high)
+    )
     return f"[{', '.join(ends)}]"
 
 

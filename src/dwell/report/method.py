@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 
-from dwell.display import decimals_for
+from dwell.display import Measure, decimals_for, write_number
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.estimators.registry import resolved
 from dwell.model import LinkDisturbance, Node, NodeDisturbance, Problem, Process, Trace
 from dwell.model.bounds import counted
 from dwell.model.disturbed import on_node
 from dwell.policies.registry import estimator_of
-from dwell.report.formatting import OURS, Measure, percent, shown_contender, write_ms, write_number
+from dwell.report.formatting import OURS, percent, shown_contender, write_ms
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import FAMILIES, Palette, contended
 from dwell.report.table import Columns, Table, Text
@@ -36,10 +36,9 @@ VARIANTS = {
 def method_blocks(
     problem: Problem, scenarios: Sequence[str], policies: Iterable[str], prefix: str = ""
 ) -> list[Block]:
-    """Return the descriptions of a cell, its placements, its scenarios and the policies."""
+    """Return the descriptions of a cell, its scenarios and the policies."""
     return [
         Definitions(cell_definitions(problem)),
-        placements_table(problem, prefix),
         scenarios_table(problem, scenarios, prefix),
         Definitions(describe_contenders(problem, policies)),
     ]

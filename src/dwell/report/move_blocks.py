@@ -6,20 +6,18 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from dwell.display import Measure
 from dwell.report.charts import NO_LIMIT, Limit, coloured, disc, layer, names, quantity, square
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import Measure
 from dwell.report.palette import MUTED, Palette
-from dwell.report.table import MOST_ROWS, Columns, Row, Table, Text
+from dwell.report.table import MOST_ROWS, WITHOUT_WARMUP, Columns, Row, Table, Text
+from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
     import polars as pl
 
-#: Predicted metrics: column, column of the standard error, name, unit and factor.
-PREDICTED = (
-    ("l95_ms", "l95_error_ms", "L95", "ms", 1.0),
-    ("violation_rate", "violation_error", "V_D", "%", 100.0),
-)
+#: Predicted metrics, each with the column of its standard error.
+PREDICTED = {METRICS["l95_ms"]: "l95_error_ms", METRICS["violation_rate"]: "violation_error"}
 #: Width left for axes and legend next to the two panels, and largest side of a panel, pixels.
 BESIDE_PX, SIDE_PX = 230, 300
 #: Share of the range that is free at each end of an axis.
@@ -47,10 +45,10 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
     import polars as pl
 
     frame = moves.with_columns(
-        pl.col(f"{when}_{name}") * factor
-        for column, error, *_, factor in PREDICTED
+        pl.col(f"{when}_{name}") * metric.factor
+        for metric, error in PREDICTED.items()
         for when in ("predicted", "seen")
-        for name in (column, error)
+        for name in (metric.column, error)
     )
     used = set(frame["to"])
     colours = {name: colour for name, colour in palette.placements.items() if name in used}
@@ -61,14 +59,14 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
         {"rows": frame},
         lambda width: {
             "hconcat": [
-                _scatter(frame, column, error, f"{name} ({unit})", limit, colours, width)
-                for (column, error, name, unit, _), limit in zip(PREDICTED, limits, strict=True)
+                _scatter(frame, metric.column, error, metric.heading, limit, colours, width)
+                for (metric, error), limit in zip(PREDICTED.items(), limits, strict=True)
             ],
         },
         "A mark is a move: up, the estimate of the placement at the close at which it was chosen; "
         "across, the mean of what its windows showed at their closes until the next move, without "
-        "the first where there are others. Bars: a standard error to each side. Line: seen as "
-        "predicted. Dashed: deadline.",
+        "the first where there are others. Bars: a standard error to each side. Each axis has its "
+        "own range. Line: seen as predicted. Dashed: deadline.",
     )
 
 
@@ -82,10 +80,12 @@ def _scatter(
     width: float,
 ) -> Spec:
     side = min((width - BESIDE_PX) / 2, SIDE_PX)
-    low, high = _range(frame, column, error)
-    scale = {"domain": [low, high], "nice": False, "zero": False}
-    across = quantity(f"seen_{column}", f"{title}, seen", scale=scale, axis={"tickCount": 5})
-    up = quantity(f"predicted_{column}", f"{title}, predicted", scale=scale, axis={"tickCount": 5})
+    ends_of = {when: _range(frame, when, column, error) for when in ("seen", "predicted")}
+    scales = {when: {"domain": [*of], "nice": False, "zero": False} for when, of in ends_of.items()}
+    across, up = (
+        quantity(f"{when}_{column}", f"{title}, {when}", scale=scale, axis={"tickCount": 5})
+        for when, scale in scales.items()
+    )
     about = names(*(name for name in ("scenario", "policy", "run") if name in frame.columns))
     about += [quantity("window", "after window"), *names("from", "to")]
     for when in ("predicted", "seen"):
@@ -119,19 +119,21 @@ def _scatter(
         "layer": [*bars, disc({"tooltip": about}, 26, opacity=0.9)],
     }
     both = {"x": {**across, "field": "at"}, "y": {**up, "field": "at"}}
+    # The part of the line of equality that both ranges have.
+    low = max(begin for begin, _ in ends_of.values())
+    high = min(end for _, end in ends_of.values())
     diagonal = {
-        "data": {"values": [{"at": low}, {"at": high}]},
+        "data": {"values": [{"at": low}, {"at": high}] if low < high else []},
         **layer("line", both, color=MUTED, strokeWidth=1),
     }
-    inside = limit if low <= limit.value <= high else NO_LIMIT
-    return square(side, across, up, inside, diagonal, moves)
+    limits = [limit if low <= limit.value <= high else NO_LIMIT for low, high in ends_of.values()]
+    return square(side, across, up, limits, diagonal, moves)
 
 
-def _range(frame: pl.DataFrame, column: str, error: str) -> tuple[float, float]:
-    """Return the ends of both axes: the range of values and error bars, with a margin."""
+def _range(frame: pl.DataFrame, when: str, column: str, error: str) -> tuple[float, float]:
+    """Return the ends of an axis: the range of values and error bars, with a margin."""
     ends = [
         value + sign * (off or 0.0)
-        for when in ("predicted", "seen")
         for value, off in frame.select(f"{when}_{column}", f"{when}_{error}").rows()
         if value is not None
         for sign in (-1, 1)
@@ -148,7 +150,8 @@ def _table(
     rows: list[Row] = []
     for move in moves.head(MOST_ROWS).iter_rows(named=True):
         row = dict(move)
-        for column, error, *_ in PREDICTED:
+        for metric, error in PREDICTED.items():
+            column = metric.column
             for when in ("predicted", "seen"):
                 value, off = move[f"{when}_{column}"], move[f"{when}_{error}"]
                 if value is not None and off is not None:
@@ -161,11 +164,11 @@ def _table(
         Text("from", "from", "placement"),
         Text("to", "to", "placement"),
         *(
-            Measure(f"{when}_{column}", f"{name} {when}", unit, factor)
-            for column, _, name, unit, factor in PREDICTED
+            metric.called(f"{metric.name} {when}", f"{when}_{metric.column}")
+            for metric in PREDICTED
             for when in ("predicted", "seen")
         ),
-        Measure("windows", "windows seen", decimals=0),
+        Measure("windows", "windows seen"),
     ]
     return Table(
         "predicted-moves",
@@ -173,6 +176,7 @@ def _table(
         columns,
         rows,
         group,
-        "±: standard error, where it is known; of what was seen, between windows.",
+        "±: standard error, where it is known; of what was seen, between windows. "
+        f"{WITHOUT_WARMUP}",
         palette,
     )

@@ -103,6 +103,7 @@ def page_html(page: Page, *, static: bool = False) -> str:
         specs = {
             figure.slug: json.dumps(figure.spec(), separators=(",", ":")).replace("</", "<\\/")
             for figure in page.figures
+            if not figure.widths
         }
     kinds = {Figure: "figure", Table: "table", Definitions: "definitions"}
     return (
@@ -115,6 +116,7 @@ def page_html(page: Page, *, static: bool = False) -> str:
             static=static,
             style=(TEMPLATES / "page.css").read_text(encoding="utf-8"),
             words=WORDS,
+            symbol=SYMBOL.pattern,
             drawn=svg,
             kind_of=lambda block: kinds[type(block)],
         )

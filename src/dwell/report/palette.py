@@ -38,9 +38,9 @@ PRINTED = {
     SHADE: "#eeeeee",
     BAD: "#b04a00",
     **dict(
-        zip(RAMP, ("#b697e3", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862"), strict=True)
+        zip(RAMP, ("#a884db", "#9d79d3", "#845dc0", "#6b43a7", "#522c87", "#3a1862"), strict=True)
     ),
-    **dict(zip(PARTS.values(), ("#4d4d4e", "#9a9a9b", "#cfcfd0"), strict=True)),
+    **dict(zip(PARTS.values(), ("#4d4d4e", "#88888a", "#cfcfd0"), strict=True)),
     **dict(zip(APART, ("#5216c9", "#80340e"), strict=True)),
 }
 

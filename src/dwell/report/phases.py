@@ -7,12 +7,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+from dwell.display import Measure
 from dwell.model.disturbed import Disturbed
 from dwell.model.order_statistic import percentile
+from dwell.model.table_columns import SHARE_OF
 from dwell.record.moves import moves
-from dwell.report.formatting import FINAL_L95, RATE, Measure
+from dwell.report.formatting import FINAL_L95
 from dwell.report.palette import Palette
-from dwell.report.table import Columns, Table, Text
+from dwell.report.table import WITH_WARMUP, Columns, Table, Text
+from dwell.study.metric import METRICS, metric_of
 from dwell.study.summary import latency_ms
 
 if TYPE_CHECKING:
@@ -120,28 +123,27 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
 def phase_table(rows: Sequence[PhaseRow], palette: Palette) -> Table:
     """Return a table with one row per phase; it has the tracking error if a phase knows it."""
     used = {name for row in rows for name in row.shares}
-    names = [name for name in palette.placements if name in used]
+    shares = {SHARE_OF.format(candidate=name): name for name in palette.placements if name in used}
     columns: Columns = [
         Text("name", "phase"),
         Measure("begin_s", "from", "s", decimals=0),
         Measure("end_s", "to", "s", decimals=0),
-        RATE,
+        METRICS["violation_rate"],
         FINAL_L95,
-        Measure("lost", "lost", decimals=0),
-        *(Measure(f"share {name}", name, "%", 100.0, 0) for name in names),
-        Measure("migrations", "migrations", decimals=0),
-        Measure("guard_moves", "by the guard", decimals=0),
+        METRICS["lost"],
+        *map(metric_of, shares),
+        METRICS["migrations"],
+        METRICS["guard_moves"],
     ]
     if any(math.isfinite(row.rms_mm) for row in rows):
         errors = Measure("rms_mm", "error", "mm", decimals=2), Measure("rms_px", "error", "px")
         columns += errors
     shown = [
-        {**row._asdict(), **{f"share {name}": row.shares.get(name, 0.0) for name in names}}
+        {**row._asdict(), **{one: row.shares.get(name, 0.0) for one, name in shares.items()}}
         for row in rows
     ]
     caption = (
-        "All cycles by when they were released, the warm-up included. Lost: cycles that never "
-        "finished."
+        f"All cycles by when they were released. Lost: cycles that never finished. {WITH_WARMUP}"
     )
     return Table("phases", "By phase", columns, shown, caption=caption)
 
@@ -163,7 +165,7 @@ def _guarded(run: Run, moved_s: Sequence[tuple[float, str]]) -> list[float]:
     for move in moves(run):
         if not move.by_guard:
             continue
-        # The last window has no next window, hence no upper bound.
+        # Without a next window there is no upper bound.
         until_ns = released_ns.get(first.get(move.window + 1, -1), math.inf)
         before_s = [at_s for at_s, name in moved_s if name == move.target]
         mine = [at_s for at_s in before_s if at_s * 1e9 <= until_ns + 1]

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.display import Measure
 from dwell.model.bounds import counted
+from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.policies.registry import estimator_of
 from dwell.report.charts import (
     NO_LIMIT,
@@ -21,53 +23,32 @@ from dwell.report.charts import (
     stacked,
 )
 from dwell.report.figure import Figure
-from dwell.report.formatting import (
-    COST,
-    L95,
-    MIGRATIONS,
-    RATE,
-    Measure,
-    own_measures,
-    shown_contender,
-    shown_policy,
-    shown_scenario,
-)
-from dwell.report.method import method_blocks
+from dwell.report.formatting import OURS, shown_contender, shown_policy, shown_scenario
+from dwell.report.method import method_blocks, placements_table
 from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
-from dwell.report.table import Columns, Table, Text
+from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text
+from dwell.report.topology import topology
 from dwell.study import AIM, over_seeds, under, windows_behind
+from dwell.study.metric import METRICS, metric_of
 
 if TYPE_CHECKING:
     import polars as pl
 
     from dwell.study import StudyRuns
 
-MEASURES = (
-    RATE,
-    L95,
-    COST,
-    Measure("u_robot", "U_r", "%", 100.0),
-    Measure("u_edge", "U_e", "%", 100.0),
-    MIGRATIONS,
-)
+#: Metrics of the table of results, and of the table of further numbers, by column.
+RESULTS = ("violation_rate", "l95_ms", "cost", "u_robot", "u_edge", "migrations")
 MORE = (
-    Measure("p95_ms", "P95 of all cycles", "ms", ends=True),
-    Measure("lost", "lost cycles"),
-    Measure("compute_ms", "computing", "ms"),
-    Measure("queue_ms", "waiting", "ms"),
-    Measure("network_ms", "network", "ms"),
-    Measure("longest_misses", "misses in a row"),
-    Measure("misses_in_20", "most misses in 20"),
-    Measure("over_5_in_100", "100 with more than 5", "%", 100.0),
-    Measure("aoi_mean_ms", "mean age", "ms"),
-    Measure("aoi_p95_ms", "age, 95 % of the time", "ms"),
-    Measure("aoi_peak_ms", "largest age", "ms"),
-    Measure("tracking_rms_mm", "tracking error", "mm"),
+    *("p95_ms", "lost", "compute_ms", "queue_ms", "network_ms", "longest_misses"),
+    *("misses_in_20", "over_5_in_100", "aoi_mean_ms", "aoi_p95_ms", "aoi_peak_ms"),
+    "tracking_rms_mm",
 )
-#: In the unit of `RATE`.
+#: Most columns of a table on a page, next to the names of policies.
+MOST_COLUMNS = 5
+#: In percent.
 THE_AIM = Limit(100 * AIM, "the aim, 5 %")
-#: The one sentence that is made of numbers (docs/decisions/0007-pages.md).
+#: Pattern of the only sentence that code makes of numbers (docs/decisions/0007-pages.md).
 HEADLINE = "V_D under 5 %: {most} in {count} of {of} scenarios; in all: {all}; not shown: {open}."
 KEYS = ("scenario", "policy")
 #: Approximate largest number of points of a line: bins of the logarithmic axis.
@@ -106,6 +87,11 @@ class PolicyBlocks:
         """Return the first blocks of a page: V_D of all policies, and counts under the aim."""
         return [self.rate(), self.counts()]
 
+    def cell(self) -> list[Block]:
+        """Return the drawing of the cell, and its placements with the nodes of movable tasks."""
+        slug = f"{self.prefix}topology"
+        return [topology(self.problem, slug), placements_table(self.problem, self.prefix)]
+
     def method(self, **about: str) -> list[Block]:
         """Return descriptions of cell, scenarios, policies and versions, and the terms `about`."""
         found = self.found
@@ -135,7 +121,7 @@ class PolicyBlocks:
     def rate(self) -> Figure:
         """Draw V_D with the aim of 5 %."""
         return self.measure(
-            RATE,
+            METRICS["violation_rate"],
             limit=THE_AIM,
             title="V_D, the share of missed deadlines",
             caption=(
@@ -147,7 +133,7 @@ class PolicyBlocks:
     def tail(self) -> Figure:
         """Draw L95 with the deadline."""
         return self.measure(
-            L95,
+            METRICS["l95_ms"],
             limit=self.deadline,
             title="L95, the 95th percentile of a window’s latencies, mean over windows",
             caption=(
@@ -272,14 +258,14 @@ class PolicyBlocks:
         ]
         columns: Columns = [
             Text("policy", "policy", "policy"),
-            *(Measure(word, word, decimals=0) for word in ("under", "over", "not shown")),
+            *(Measure(word, word) for word in ("under", "over", "not shown")),
         ]
         return Table(
             f"{self.prefix}counts",
             "V_D and the aim of 5 %, number of scenarios",
             columns,
             rows,
-            caption="By one-sided 95 % limits over seeds.",
+            caption=f"By one-sided 95 % limits over seeds. {WITHOUT_WARMUP}",
             palette=self.palette,
         )
 
@@ -290,20 +276,21 @@ class PolicyBlocks:
         half of the others.
         """
         shares = [
-            Measure(f"share_{name}", name, "%", 100.0, 0)
+            metric_of(column)
             for name in self.problem.candidates
-            if f"share_{name}" in self.runs.columns
+            if (column := SHARE_OF.format(candidate=name)) in self.runs.columns
         ]
-        table = self._table([*MEASURES, *shares])
+        metrics = [METRICS[column] for column in RESULTS]
+        table = self._table([*metrics, *shares])
         rows = [
             {**row, "is": self.standing(row["scenario"], row["policy"])} for row in table.to_dicts()
         ]
         # The table has no room for the intervals of shares.
-        bare = [*shares, *(MEASURES[3:5] if compact else ())]
+        bare = [*shares, *(metrics[3:5] if compact else ())]
         for row in rows:
             for measure in bare:
                 row.pop(f"{measure.column}_low")
-        first, *others = MEASURES
+        first, *others = metrics
         columns: Columns = [
             Text("policy", "policy", "policy"),
             first,
@@ -320,29 +307,27 @@ class PolicyBlocks:
             f"Means over {counted(len(set(self.runs['seed'])), 'seed')} with their 95 % intervals"
             f"{' (±: their larger half)' if compact else ''}. L95: 95th "
             "percentile of a window’s latencies, mean over windows. U_r, U_e: busiest robot and "
-            "edge node. Last columns: share of the windows under each placement. ATP is our "
-            "reconstruction.",
+            "edge node. Last columns: share of the windows under each placement. "
+            f"{WITHOUT_WARMUP} {OURS}",
             self.palette,
             compact,
         )
 
     def more(self) -> Table:
         """Return further numbers of every policy in every scenario."""
-        used = [
-            Measure(f"node_{name}", f"U of {name}", "%", 100.0)
-            for name in self.problem.fabric.resources
-        ]
-        known = (*MORE, *used, *own_measures(self.found.metrics))
-        measures = [one for one in known if one.column in self.runs.columns]
+        used = [USE_OF.format(resource=name) for name in self.problem.fabric.resources]
+        known = (*MORE, *used, *self.found.metrics)
+        metrics = [metric_of(column) for column in known if column in self.runs.columns]
         return Table(
             f"{self.prefix}more",
             "More numbers",
-            [Text("policy", "policy", "policy"), *measures],
-            self._table(measures).to_dicts(),
+            [Text("policy", "policy", "policy"), *metrics],
+            self._table(metrics).to_dicts(),
             Text("scenario", "", "scenario"),
             "P95 counts lost cycles as infinite: median over seeds. Computing, waiting, network: "
             "means over finished cycles. Misses in any 20 and any 100 cycles that follow each "
-            "other. Age: of the newest command in effect, from its cycle’s release.",
+            "other. Age: of the newest command in effect, from its cycle’s release. "
+            f"{WITHOUT_WARMUP}",
             self.palette,
         )
 

@@ -98,7 +98,7 @@ class Tracking(NamedTuple):
 
     @classmethod
     def of(cls, meta: Mapping[str, Any]) -> Tracking | None:
-        """Read the error from the record of a run, None without one; `RunError` if malformed."""
+        """Read the error from a run's record, if it has one; raise `RunError` if malformed."""
         kept = meta.get("tracking")
         if kept is None:
             return None

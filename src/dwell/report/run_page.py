@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.display import decimals_for
+from dwell.display import Measure, decimals_for, write_number
 from dwell.model.bounds import counted
-from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
+from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES, shown_reason
 from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
+    OUTLINE,
     PART_COLOURS,
     PARTS_SHOWN,
     Limit,
@@ -32,24 +33,21 @@ from dwell.report.charts import (
 )
 from dwell.report.figure import Figure
 from dwell.report.formatting import (
-    COST,
     FINAL_L95,
-    L95,
-    RATE,
-    Measure,
     percent,
     shown_policy,
     shown_scenario,
     write_ms,
-    write_number,
 )
 from dwell.report.move_blocks import move_blocks
 from dwell.report.page import Definitions, Fact, Page, Section, page_html
 from dwell.report.palette import BAD, Palette
 from dwell.report.phases import phase_rows, phase_table
 from dwell.report.run_header import RunHeader
-from dwell.report.table import MOST_ROWS, Columns, Table, Text
+from dwell.report.table import MOST_ROWS, WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
+from dwell.report.topology import topology
+from dwell.study.metric import METRICS
 from dwell.study.other_placements import PLACEMENTS
 from dwell.study.predicted_moves import predicted_moves
 from dwell.study.summary import (
@@ -133,28 +131,27 @@ class _RunPage:
         return shown_policy(self.header.policy_name)
 
     def _facts(self) -> Iterator[Fact]:
-        row = {name: float(value) for name, value in self.row.items() if not isinstance(value, str)}
-        deadline = f"deadline {write_ms(self.header.deadline_ms)}"
+        row = {name: value for name, value in self.row.items() if not isinstance(value, str)}
         verdict = verdict_of(self.run, self.header.problem, row["violation_rate"])
-        yield Fact(
-            "V_D, deadlines missed",
-            percent(verdict.rate, 2),
-            f"aim: under {percent(verdict.aim)}",
-            verdict.word,
-        )
-        yield Fact("L95 of all cycles", write_ms(row["p95_ms"]), deadline)
-        yield Fact("misses in a row", write_number(row["longest_misses"], 0), "at most")
-        yield Fact("J", write_number(row["cost"], 2), "mean")
-        undone = f"{self.row['returns']} undone"
-        yield Fact("migrations", write_number(row["migrations"], 0), undone)
-        if row["guard_moves"]:
-            yield Fact("moves of the guard", write_number(row["guard_moves"], 0))
+        remarks = {
+            "violation_rate": f"aim: under {percent(verdict.aim)}",
+            "p95_ms": f"deadline {write_ms(self.header.deadline_ms)}",
+            "longest_misses": "",
+            "cost": "",
+            "migrations": f"{row['returns']} undone",
+            **({"guard_moves": ""} if row["guard_moves"] else {}),
+        }
+        for column, remark in remarks.items():
+            word = verdict.word if column == "violation_rate" else ""
+            metric = METRICS[column]
+            yield Fact(metric.title, metric.text(row[column]), remark, word)
         yield Fact("cycles", write_number(row["cycles"], 0))
 
     def _sections(self) -> Iterator[Section]:
         yield Section("", [self._timeline(), *self._phases()])
         if placements := self.run.meta.get(PLACEMENTS):
             yield Section("If it never moved", [self._never_moving(placements)])
+        yield Section("The cell", [topology(self.header.problem)])
         yield Section("Worst windows", [self._worst_table()])
         for window in self.worst.iter_rows(named=True):
             number = window["window"]
@@ -191,10 +188,10 @@ class _RunPage:
             links=links,
             caption=(
                 "L95 seen: of the latencies at the window's close, where a cycle that has not "
-                "finished counts with its age. Thin lines: J of the other placements as the policy "
-                "estimated it. Dashed: the aim of 5 %, and the deadline. Upright lines: "
-                "migrations; in colour, the guard's. Shaded: warm-up and disturbances. U: all of a "
-                "node's load, foreign work included."
+                "finished counts with its age; a triangle at the top is a lost L95. Thin lines: J "
+                "of the other placements as the policy estimated it. Dashed: the aim of 5 %, and "
+                "the deadline. Upright lines: migrations; in colour, the guard's. Shaded: warm-up "
+                "and disturbances. U: all of a node's load, foreign work included."
                 f"{' Marks of the worst windows lead to their cycles.' if links else ''}"
             ),
         )
@@ -213,13 +210,11 @@ class _RunPage:
             rows.append({**self.row, "placement": f"{self._policy()}, this run"})
         columns: Columns = [
             Text("placement", "placement", "placement"),
-            RATE._replace(decimals=2),
-            L95,
-            COST,
+            *(METRICS[column] for column in ("violation_rate", "l95_ms", "cost")),
         ]
         caption = (
             "Each placement by itself, without moves, on the same random draws. At most 8 "
-            "placements are simulated."
+            f"placements are simulated. {WITHOUT_WARMUP}"
         )
         return Table("never-moving", "", columns, rows, caption=caption, palette=self.palette)
 
@@ -235,14 +230,15 @@ class _RunPage:
             Text("window", "window", link="#window-{window}"),
             Measure("begin_s", "at", "s"),
             Text("placement", "placement", "placement"),
-            RATE,
+            METRICS["violation_rate"],
             FINAL_L95,
-            COST,
+            METRICS["cost"],
             *(Measure(f"u_{name}", name, "%", 100.0, 0) for name in resources),
         ]
         caption = (
             "The windows with the most misses. L95 final: of the latencies that cycles had in the "
-            "end, ∞ where more than 5 % never finished; the figure has what was seen at the close."
+            "end, ∞ where more than 5 % never finished; the figure has what was seen at the close. "
+            f"{WITHOUT_WARMUP}"
         )
         return Table("worst", "", columns, rows, caption=caption, palette=self.palette)
 
@@ -286,7 +282,7 @@ class _RunPage:
         }
         top = {"x": across, "y": {"value": 6}, "tooltip": [cycle, outcome]}
         layers = [
-            in_order(layer("bar", time, rows="parts"), PART_COLOURS),
+            in_order(layer("bar", time, rows="parts", **OUTLINE), PART_COLOURS),
             *limit_rule("y", self.header.deadline_ms, "deadline"),
         ]
         if len(lost):
@@ -377,9 +373,9 @@ class _RunPage:
         columns: Columns = [
             Text("reason", "reason"),
             Text("meaning", "meaning"),
-            Measure("times", "times", decimals=0),
+            Measure("times", "times"),
         ]
-        yield Table("reasons", "Why it was decided so", columns, rows)
+        yield Table("reasons", "Why it was decided so", columns, rows, caption=WITHOUT_WARMUP)
         if "shadow_cycles" in self.counted.windows.columns:
             yield self._shadows()
         if found := moves_in(decisions):
@@ -402,7 +398,10 @@ class _RunPage:
             Measure("rate_mbps", "sent more", "Mbit/s", decimals=2),
             *(Measure(name, f"of {name.removeprefix('shadow_')}", "%", 100.0, 2) for name in used),
         ]
-        caption = "Cycles that went through another placement as well, for the estimator."
+        caption = (
+            "Cycles that went through another placement as well, for the estimator. "
+            f"{WITHOUT_WARMUP}"
+        )
         return Table("shadows", "What shadow jobs cost", columns, [row], caption=caption)
 
     def _migrations(self, decisions: pl.DataFrame, found: Sequence[Move]) -> Table:
@@ -417,7 +416,7 @@ class _RunPage:
                     "at_s": self.begin_of.get(known, math.nan) + later_s,
                     "from": move.source,
                     "to": move.target,
-                    "reason": move.reason,
+                    "reason": shown_reason(move.reason),
                     "before": cost.get(move.window),
                     "estimated": decisions[f"j_{move.target}"][move.row],
                     "after": cost.get(move.window + 1),
@@ -429,9 +428,7 @@ class _RunPage:
             Text("from", "from", "placement"),
             Text("to", "to", "placement"),
             Text("reason", "reason"),
-            Measure("before", "J before", decimals=2),
-            Measure("estimated", "J estimated", decimals=2),
-            Measure("after", "J after", decimals=2),
+            *(METRICS["cost"].called(f"J {one}", one) for one in ("before", "estimated", "after")),
         ]
         return Table(
             "migrations",
@@ -440,7 +437,7 @@ class _RunPage:
             rows,
             caption=(
                 "J as measured in the window before the move, as estimated for the target, and as "
-                "measured in the first window on it."
+                f"measured in the first window on it. {WITHOUT_WARMUP}"
             ),
             palette=self.palette,
         )
@@ -525,8 +522,8 @@ def _counts(
         }
         for one, text in meanings.items()
     ]
-    measures = Measure(what, what, decimals=0), Measure("share", "share", "%", 100.0, decimals)
-    return Table(slug, title, [*columns, *measures], rows)
+    measures = Measure(what, what), Measure("share", "share", "%", 100.0, decimals)
+    return Table(slug, title, [*columns, *measures], rows, caption=WITHOUT_WARMUP)
 
 
 def _moving(header: RunHeader, name: str) -> str:

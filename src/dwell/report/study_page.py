@@ -3,34 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING
 
+from dwell.display import Measure
 from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, curves
 from dwell.report.figure import Figure
-from dwell.report.formatting import (
-    COST,
-    L95,
-    MIGRATIONS,
-    ORACLE_REGRET,
-    RATE,
-    REGRET,
-    Measure,
-    few_seeds,
-    independent_runs,
-    own_measures,
-)
+from dwell.report.formatting import few_seeds, independent_runs
 from dwell.report.method import numbered
 from dwell.report.page import Block, Definitions, Page, Section, page_html
-from dwell.report.policy_blocks import THE_AIM, PolicyBlocks, named, scaled
-from dwell.report.table import Table, Text
+from dwell.report.policy_blocks import MOST_COLUMNS, THE_AIM, PolicyBlocks, named, scaled
+from dwell.report.table import WITHOUT_WARMUP, Table, Text
 from dwell.study import StudyRuns, over_seeds
+from dwell.study.metric import Metric, metric_of
 
 if TYPE_CHECKING:
     import polars as pl
 
+#: Metrics by column.
+SHOWN = ("violation_rate", "l95_ms", "cost", "migrations", "regret", "oracle_regret")
 #: Parameters that change the deadline.
 DEADLINES = ("parameter.deadline_ms", "parameter.period_ms")
 
@@ -60,28 +53,29 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
     if study.parameters:
         for place in range(len(study.axes)):
             yield from _by_axis(study, blocks, place)
+        yield Section("The cell and its placements", blocks.cell())
         yield Section("Every point", [_points(study, blocks)], folded=True)
     else:
         yield Section("", blocks.answer())
-        yield Section("Results", [blocks.results()])
-        figures = [blocks.tail(), blocks.measure(COST, title="J"), blocks.distribution()]
-        if REGRET in _measures(study):
-            figures.append(blocks.measure(REGRET, title="Regret"))
-            figures.append(blocks.measure(ORACLE_REGRET, title="J over the oracle"))
-        figures += [blocks.measure(one, title=one.name) for one in own_measures(study.metrics)]
+        yield Section("The cell and its placements", blocks.cell())
+        yield Section("Results", blocks.results().parts(MOST_COLUMNS))
+        columns = ["cost", "regret", "oracle_regret", *study.metrics]
+        drawn = [metric_of(name) for name in columns if name in study.runs.columns]
+        figures = [blocks.tail(), blocks.distribution()]
+        figures += [blocks.measure(metric, title=metric.title) for metric in drawn]
         yield Section("Figures", [*figures, *blocks.placed(), blocks.split()])
-        yield Section("More numbers", [blocks.more()])
+        yield Section("More numbers", blocks.more().parts(MOST_COLUMNS), folded=True)
     method = blocks.method(
         runs=f"{counted(study.windows, 'window')}, {numbered(study.seeds)}",
         intervals="95 %, two-sided, over seeds, by the studentised bootstrap, each on its own."
         f"{independent_runs(study.runs)}",
     )
-    yield Section("How it was made", method)
+    yield Section("Method", method, folded=True)
 
 
-def _measures(study: StudyRuns) -> list[Measure]:
-    measures = (RATE, L95, COST, MIGRATIONS, REGRET, ORACLE_REGRET, *own_measures(study.metrics))
-    return [one for one in measures if one.column in study.runs.columns]
+def _metrics(study: StudyRuns) -> list[Metric]:
+    columns = (*SHOWN, *study.metrics)
+    return [metric_of(name) for name in columns if name in study.runs.columns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,7 +137,7 @@ def _by_axis(study: StudyRuns, blocks: PolicyBlocks, place: int) -> Iterator[Sec
     said = {term: meaning for term, meaning in about.items() if meaning}
     figures: list[Block] = []
     tables: list[Block] = []
-    for measure in _measures(study):
+    for measure in _metrics(study):
         means = view.means(measure)
         figures.append(_curve(means, blocks, view, measure))
         tables.append(_pivot(means, blocks, view, measure))
@@ -173,9 +167,9 @@ def _curve(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
     frame = named(rows.select(columns))
     if at.dtype.is_numeric():
         frame = frame.sort("at", maintain_order=True)
-    limits = {RATE.column: THE_AIM}
+    limits = {"violation_rate": THE_AIM}
     if not set(DEADLINES) & set(view.study.parameters):
-        limits[L95.column] = blocks.deadline
+        limits["l95_ms"] = blocks.deadline
     remark = f"averaged over {view.shown_averaged}" if view.averaged else ""
     draw = curves(
         frame, measure, blocks.styles, view.shown, limits.get(measure.column, NO_LIMIT), remark
@@ -197,7 +191,7 @@ def _pivot(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
         mine = rows.setdefault(tuple(keys.values()), {**keys, "averaged_over": view.shown_averaged})
         for end in ("", "_low", "_high"):
             mine[f"{row[view.at]}{end}"] = row[f"{measure.column}{end}"]
-    columns = [measure._replace(column=value, name=value, unit="") for value in values]
+    columns = [replace(measure, column=value, name=value, unit="") for value in values]
     return Table(
         f"pivot-{measure.column}-{view.place}",
         f"{measure.heading} by {view.shown}",
@@ -208,13 +202,14 @@ def _pivot(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
         ],
         sorted(rows.values(), key=lambda row: blocks.scenarios.index(str(row["scenario"]))),
         Text("scenario", "", "scenario"),
-        palette=blocks.palette,
+        WITHOUT_WARMUP,
+        blocks.palette,
     )
 
 
 def _points(study: StudyRuns, blocks: PolicyBlocks) -> Table:
     """Return a table with one row per point, scenario and policy."""
-    measures = _measures(study)
+    measures = _metrics(study)
     keys = (*study.parameters, "scenario", "policy")
     table = over_seeds(study.runs, keys, [one.column for one in measures])
     return Table(
@@ -227,5 +222,6 @@ def _points(study: StudyRuns, blocks: PolicyBlocks) -> Table:
         ],
         table.to_dicts(),
         Text("scenario", "", "scenario"),
-        palette=blocks.palette,
+        WITHOUT_WARMUP,
+        blocks.palette,
     )

@@ -7,16 +7,11 @@ import itertools
 import math
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, TypeAlias
 
-from dwell.report.formatting import (
-    Measure,
-    shown_contender,
-    shown_scenario,
-    write_interval,
-    write_number,
-)
+from dwell.display import Measure
+from dwell.report.formatting import shown_contender, shown_scenario, write_interval
 from dwell.report.palette import CIRCLE, MUTED, Palette
 from dwell.study import Interval
 
@@ -28,6 +23,8 @@ Kind: TypeAlias = Literal["text", "cell", "policy", "placement", "scenario", "wo
 PROSE = 100
 #: Largest number of rows in tables of moves.
 MOST_ROWS = 200
+#: Ends of the captions of tables, which say whether numbers include the warm-up.
+WITHOUT_WARMUP, WITH_WARMUP = "Without the warm-up.", "With the warm-up."
 #: Meaning of the words of verdicts; other words are open.
 WORDS: Mapping[str, Literal["good", "bad"]] = {
     "under": "good",
@@ -108,6 +105,21 @@ class Table:
         ):
             yield heading, [[self._cell(column, row) for column in columns] for row in rows]
 
+    def parts(self, most: int) -> list[Table]:
+        """Return tables with at most `most` columns after the first, which each of them has."""
+        first, *others = self.columns
+        still = WITHOUT_WARMUP if WITHOUT_WARMUP in self.caption else ""
+        return [
+            replace(
+                self,
+                slug=self.slug if begin == 0 else f"{self.slug}-{begin // most + 1}",
+                title=self.title if begin == 0 else "",
+                caption=self.caption if begin == 0 else still,
+                columns=[first, *others[begin : begin + most]],
+            )
+            for begin in range(0, len(others), most)
+        ]
+
     def _sized(self, column: Text | Measure) -> Text | Measure:
         """Return a column with decimals for the largest of its numbers."""
         if isinstance(column, Text):
@@ -123,12 +135,10 @@ class Table:
         value = row.get(column.column)
         if isinstance(value, str):
             return Cell(value, kind="num", sort=value)
-        number = math.nan if value is None else float(value)
+        number: float = math.nan if value is None else value
         low, high = (row.get(f"{column.column}{end}") for end in ("_low", "_high"))
         if low is None or high is None:
-            shown = column.factor * number
-            text = write_number(shown, column.decimals, signed=column.signed) if shown else "0"
-            return Cell(text, kind="num", sort=_sortable(shown))
+            return Cell(column.number(number), kind="num", sort=_sortable(column.factor * number))
         written = write_interval(Interval(number, low, high), column, larger_half=self.compact)
         return Cell(written.value, written.error, "num", _sortable(number))
 
@@ -173,8 +183,7 @@ def interval_row(values: Mapping[str, Interval]) -> dict[str, float | None]:
 def table_text(table: Table, *, width: int | None = None) -> str:
     """Return a table as text: title, rows and caption.
 
-    `width` is the width of the terminal in columns; long cells fold. None does not limit the
-    width of rows.
+    `width` is the width of the terminal in columns, or None for rows of any width; long cells fold.
     """
     from rich.console import Console
     from rich.table import Table as Grid

@@ -8,11 +8,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.record import shown_reason
 from dwell.record.moves import GUARD
-from dwell.report.charts import coloured, disc, is_wide, layer, limit_rule, name_of, names, quantity
+from dwell.report.charts import (
+    coloured,
+    disc,
+    is_wide,
+    layer,
+    limit_rule,
+    name_of,
+    names,
+    number_of,
+    quantity,
+)
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
 from dwell.study import AIM
+from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
     import polars as pl
@@ -33,13 +45,15 @@ A_BIN = (
     "their quartiles, a line between their extremes, in the colour of the placement that most of "
     "them had; of U, a line and bands. "
 )
+#: Distance of an outlier above the upper quartile, in distances between the quartiles.
+FAR = 1.5
 PANEL_PX, USE_PX = 86, 56
 #: Height of the row of a cell, and largest height of all rows, pixels.
 ROW_PX, ROWS_PX = 17, 640
 DASHES: tuple[list[int], ...] = ([], [6, 3], [2, 2], [6, 2, 2, 2])
 #: Scales that panels do not share.
 OWN = ("color", "strokeDash")
-L95 = "L95 seen (ms)"
+RATE, L95 = METRICS["violation_rate"], METRICS["l95_ms"].called("L95 seen")
 WARMUP, UNPROVEN = "warm-up", "clocks unproven"
 AT = quantity("time", "at (s)", format=".1f")
 #: Layer of every panel: shades for warm-up, unproven clocks and disturbances.
@@ -52,6 +66,19 @@ SHADES = layer(
     },
     rows="spans",
     color=SHADE,
+)
+
+
+#: Layer of a mark at the top for every window with a lost L95.
+LOST = layer(
+    "point",
+    {"y": {"value": 4}, "tooltip": [quantity("window", "window, L95 lost: from"), AT]},
+    rows="windows",
+    where=["datum.lost"],
+    shape="triangle-up",
+    filled=True,
+    size=30,
+    color=BAD,
 )
 
 
@@ -88,18 +115,7 @@ def run_timeline(
     deadline_ms, resources = problem.pipeline.deadline_ms, resources_in(windows, problem)
     placements = Palette.of(problem.candidates).placements
     each = 1 if windows.height <= MOST_MARKS else math.ceil(windows.height / MOST_BINS)
-    frame = pl.DataFrame(
-        {
-            "window": windows["window"],
-            "time": begin_s + length_s / 2,
-            "placement": windows["placement"].cast(pl.String),
-            "v_d": windows["violation_rate"] * 100,
-            "l95": windows["seen_l95_ms"],
-            "j": windows["cost"],
-            "link": [(links or {}).get(number) for number in windows["window"].to_list()],
-        },
-        strict=False,
-    ).with_columns(link=pl.col("link").cast(pl.String))
+    frame = _seen(windows, begin_s + length_s / 2, problem.censor_ms, links or {})
     if tracking is not None:
         errors = [tracking.rms(begin, begin + length_s)[0] for begin in begin_s.tolist()]
         frame = frame.with_columns(error=pl.Series(errors, dtype=pl.Float64))
@@ -115,18 +131,33 @@ def run_timeline(
     aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
     colours = {name: colour for name, colour in placements.items() if name in used}
+    rates = _marks("v_d", RATE.heading, colours, each, _range_of(frame["v_d"], 0.0, 100 * AIM))
+    tail_ms = _range_of(frame["l95"], deadline_ms)
+    tails = _marks("l95", L95.heading, colours, each, tail_ms, log=wide)
+    costs = _range_of(pl.concat([frame["j"], frames["estimates"]["j"]]))
+    priced = [_others(placements, costs), *_marks("j", "J", placements, each, costs)]
     panels: list[tuple[float, list[Spec]]] = [
-        (PANEL_PX, [*aim, *_marks("v_d", "V_D (%)", colours, each)]),
-        (PANEL_PX, [*due, *_marks("l95", L95, colours, each, log=wide)]),
-        (PANEL_PX, [_others(placements), *_marks("j", "J", colours, each)]),
+        (PANEL_PX, [*aim, *rates]),
+        (PANEL_PX, [*due, *tails, LOST]),
+        (PANEL_PX, priced),
         (USE_PX, _use(resources, each)),
     ]
     if tracking is not None:
-        panels.append((PANEL_PX, [*_marks("error", "tracking error (mm)", colours, each)]))
+        errors_mm = _range_of(frame["error"])
+        panels.append((PANEL_PX, _marks("error", "tracking error (mm)", colours, each, errors_mm)))
 
     draw = _over_time(panels, end_s, each, frames["moves"].height)
     mark = A_BIN if each > 1 else A_WINDOW if caption else ""
     return Figure(slug, title, frames, draw, f"{mark}{caption}".strip())
+
+
+def _range_of(values: pl.Series, *also: float) -> list[float]:
+    """Return the ends of an axis for the finite values, and for `also`; some ends in any case."""
+    known = values.drop_nulls().cast(float)
+    found = [*known.filter(known.is_finite()), *also]
+    low, high = (min(found), max(found)) if found else (0.0, 1.0)
+    room = 0.04 * (high - low) or 0.04 * abs(high) or 1.0
+    return [max(low - room, 0.0) if low >= 0 else low - room, high + room]
 
 
 def rows_px(cells: int) -> float:
@@ -203,6 +234,32 @@ def fleet_timeline(
 # -------------------------------------------------------------------------------------- data
 
 
+def _seen(
+    windows: pl.DataFrame,
+    middle_s: NDArray[np.float64],
+    censor_ms: float,
+    links: Mapping[int, str],
+) -> pl.DataFrame:
+    """Return the metrics of windows, with one row per window; a lost L95 has no value."""
+    import polars as pl
+
+    frame = pl.DataFrame(
+        {
+            "window": windows["window"],
+            "time": middle_s,
+            "placement": windows["placement"].cast(pl.String),
+            "v_d": windows["violation_rate"] * 100,
+            "l95": windows["seen_l95_ms"],
+            "lost": windows["seen_l95_ms"] >= censor_ms,
+            "j": windows["cost"],
+            "link": [links.get(number) for number in windows["window"].to_list()],
+        },
+        strict=False,
+    )
+    known = pl.when(pl.col("lost").not_()).then(pl.col("l95"))
+    return frame.with_columns(link=pl.col("link").cast(pl.String), l95=known)
+
+
 def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFrame:
     """Return one row per mark: a window, or `each` windows with the quantiles of every measure.
 
@@ -214,6 +271,8 @@ def _binned(frame: pl.DataFrame, each: int, by: Sequence[str] = ()) -> pl.DataFr
         return frame
     numbers = [name for name, kind in frame.schema.items() if kind.is_float() and name != "time"]
     firsts = [pl.col("window").first(), pl.len().alias("windows"), pl.col("time").mean()]
+    if "lost" in frame.columns:
+        firsts.append(pl.col("lost").any())
     if "placement" in frame.columns and "placement" not in by:
         firsts.append(pl.col("placement").mode(maintain_order=True).first())
     if "link" in frame.columns:
@@ -237,14 +296,28 @@ def _stays(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _spread(rates: pl.DataFrame, step_s: float) -> pl.DataFrame:
-    """Return mean and range of V_D over cells, from one row per cell and stretch of time."""
+    """Return mean, quartiles and largest V_D of cells, from one row per cell and stretch of time.
+
+    `outlier` has the name of the worst cell if it is far above the quartiles: by more than 1.5
+    times their distance.
+    """
     import polars as pl
 
     rate = pl.col("v_d")
-    spread = {"min": rate.min(), "mean": rate.mean(), "max": rate.max()}
+    spread = {
+        "q1": rate.quantile(0.25, "linear"),
+        "mean": rate.mean(),
+        "median": rate.median(),
+        "q3": rate.quantile(0.75, "linear"),
+        "max": rate.max(),
+    }
     by_bin = rates.sort("v_d", descending=True).group_by("bin", maintain_order=True)
     found = by_bin.agg(worst=pl.col("cell").first(), **spread)
-    return found.with_columns(time=(pl.col("bin") + 0.5) * step_s).sort("bin")
+    far = pl.col("max") > pl.col("q3") + FAR * (pl.col("q3") - pl.col("q1"))
+    return found.with_columns(
+        time=(pl.col("bin") + 0.5) * step_s,
+        outlier=pl.when(far & (pl.col("max") > pl.col("q3"))).then(pl.col("worst")),
+    ).sort("bin")
 
 
 def resources_in(windows: pl.DataFrame, problem: Problem) -> tuple[str, ...]:
@@ -317,7 +390,7 @@ def _moves(timed: pl.DataFrame) -> pl.DataFrame:
     return timed.filter("migrated").select(
         "time",
         pl.format("{} → {}", "incumbent", "placement").alias("move"),
-        pl.col("reason").cast(pl.String),
+        pl.col("reason").cast(pl.String).map_elements(shown_reason, return_dtype=pl.String),
     )
 
 
@@ -411,10 +484,18 @@ def _migrations(count: int) -> Spec:
 
 
 def _marks(
-    field: str, title: str, colours: Mapping[str, str], each: int, *, log: bool = False
+    field: str,
+    title: str,
+    colours: Mapping[str, str],
+    each: int,
+    ends: Sequence[float],
+    *,
+    log: bool = False,
 ) -> list[Spec]:
-    """Return the marks of a panel, each for `each` windows."""
-    scale: Spec = {"type": "log", "nice": False} if log else {"zero": field == "v_d"}
+    """Return the marks of a panel, one per `each` windows; `ends` are the ends of its y axis."""
+    scale: Spec = {"domain": [*ends], "nice": False, "zero": False}
+    if log:
+        scale |= {"type": "log", "domain": [max(ends[0], ends[1] * 1e-4), ends[1]]}
     legend = {"symbolSize": 60, "symbolOpacity": 0.9} if field == "v_d" else None
     shown = field if each == 1 else f"{field}_median"
     colour = coloured("placement", colours, legend=legend)
@@ -464,28 +545,31 @@ def _placed(cells: Sequence[str], colours: Mapping[str, str]) -> Spec:
             *names("cell", "placement"),
             quantity("begin", "from (s)", format=".1f"),
             quantity("end", "to (s)", format=".1f"),
-            quantity("v_d", "V_D (%)"),
+            number_of("v_d", RATE),
         ],
     }
     return layer("rect", encoding, rows="placed", height={"band": 0.8})
 
 
 def _rates() -> list[Spec]:
-    """Return the layers of the mean of V_D over cells and of its range, a band."""
+    """Return the layers of the median of V_D over cells, of its quartiles, and of outliers."""
     about = [AT, *names("worst")]
-    about += [quantity(how, f"{how} (%)") for how in ("max", "mean", "min")]
-    up = {"y": quantity("mean", "V_D (%)", axis={"tickCount": 4})}
-    band = {"y": quantity("min", "V_D (%)"), "y2": "max"}
+    about += [number_of(how, RATE.called(how)) for how in ("max", "q3", "median", "mean", "q1")]
+    up = {"y": quantity("median", RATE.heading, axis={"tickCount": 4})}
+    band = {"y": quantity("q1", RATE.heading), "y2": "q3"}
+    outlier = {"y": quantity("max", RATE.heading), "tooltip": about}
     return [
-        layer("area", band, rows="rates", color=MUTED, opacity=0.3),
+        layer("area", band, rows="rates", color=MUTED, opacity=0.45),
         layer("line", up, rows="rates", color=INK, strokeWidth=1.1),
         layer("point", {**up, "tooltip": about}, rows="rates", filled=True, size=8, color=INK),
+        layer("point", outlier, rows="rates", where=["isValid(datum.outlier)"], size=14, color=BAD),
     ]
 
 
-def _others(colours: Mapping[str, str]) -> Spec:
+def _others(colours: Mapping[str, str], ends: Sequence[float]) -> Spec:
+    scale = {"domain": [*ends], "nice": False, "zero": False}
     encoding = {
-        "y": quantity("j", "J", scale={"zero": False}, axis={"tickCount": 4}),
+        "y": quantity("j", "J", scale=scale, axis={"tickCount": 4}),
         "color": coloured("placement", colours, legend=None),
     }
     return layer("line", encoding, rows="estimates", strokeWidth=1, opacity=0.75)

@@ -20,7 +20,7 @@ from dwell.control import (
     plain_rule,
 )
 from dwell.errors import SimulationError
-from dwell.kernels.advance import logged_window, play
+from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, cell_of, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
@@ -63,7 +63,8 @@ def simulate(
         ``cusum+corrected``), a candidate's name for a fixed placement, or None for the policy of
         the cell file. The simulation leaves the caller's object unchanged.
     estimator : Estimator, str, or None
-        An object with ``estimate``, an estimator's name, or None for that of the cell file.
+        An object with ``estimate``, an estimator's name, or None for the estimator of
+        the cell file.
     seed : int
         Seed of all random streams; one seed gives all policies the same realisation.
     windows : int
@@ -158,7 +159,7 @@ def _play(
     *,
     shadow: bool = False,
 ) -> PlayedRealisation | None:
-    """Simulate a realisation; return None if the guard wants probes and there is no shadow."""
+    """Simulate a realisation; return None if the guard wants probes but has no shadow."""
     controller = Controller(problem, policy, estimator)
     cell = PlayedCell(problem, realisation, controller, guard and controller.guarded)
     played = play_cells([cell], jobs=jobs, by_window=by_window, shadow=shadow)
@@ -191,7 +192,7 @@ def play_cells(
     shadow: bool = False,
     progress: Progress | None = None,
 ) -> list[PlayedRealisation] | None:
-    """Simulate cells together; return None if a cell without a shadow wants probes.
+    """Simulate cells together; return None if a cell wants probes but has no shadow.
 
     Parameters
     ----------
@@ -222,7 +223,7 @@ def play_cells(
         ],
     )
     stampers = [
-        _Stamper(cell, CellArrays(whole, i), plan, shared)
+        SimulatedStamper(cell, CellArrays(whole, i), plan, shared)
         for i, (cell, plan) in enumerate(zip(cells, plans, strict=True))
     ]
     first = stampers[0]
@@ -256,7 +257,7 @@ def play_cells(
 
 
 def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
-    """Return the plan of a cell's shadows; None if it needs none."""
+    """Return the plan of a cell's shadows, if it needs shadows."""
     if not (probes or cell.controller.sends_shadows):
         return None
     return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
@@ -286,7 +287,7 @@ def _host_changes(problem: Problem, realisation: Realisation) -> NDArray[np.int6
     return changes.table[np.isin(changes.table[:, 1], mine)]
 
 
-class _Stamper:
+class SimulatedStamper:
     """Passes closed windows to the controller, and stamps cycles with the ordered placement."""
 
     def __init__(
@@ -360,12 +361,12 @@ class _Stamper:
         """Return the number of cycles released by the decision on the window before `boundary`."""
         if boundary > self.cycles:
             return boundary
-        close_ns = self._close_ns(boundary)
+        close_ns = self.close_ns(boundary)
         if close_ns <= self.release_ns.item(boundary):
             return boundary
         return int(np.searchsorted(self.release_ns, close_ns, side="right"))
 
-    def _close_ns(self, boundary: int) -> int:
+    def close_ns(self, boundary: int) -> int:
         """Return when the window before the cycle `boundary` closes (see `window_close_ns`)."""
         due_ns: int = self.release_ns.item(boundary - 1) + self.due_ns
         return max(due_ns, self.release_ns.item(boundary) + self.grace_ns)
@@ -396,7 +397,7 @@ class _Stamper:
         index = self.made.item(0) - 1
         cycles = self.seen[1].item(0, index)
         boundary = self.seen[0].item(0, index) + cycles
-        close_ns = self._close_ns(boundary)
+        close_ns = self.close_ns(boundary)
         left = self.course.placement
         self.controller.looked = LookedAt(self._window_of(boundary - 1), boundary - 1, cycles)
         if len(self.decided):
@@ -406,7 +407,7 @@ class _Stamper:
             if not self.looks:
                 self.metrics.append((None, None, None))
         else:
-            self._decide(index, boundary, close_ns)
+            self.consult(index, boundary, close_ns)
         if left == self.course.placement:
             self._go_on(boundary)
             return
@@ -428,7 +429,7 @@ class _Stamper:
             window -= 1
         return window
 
-    def _decide(self, index: int, boundary: int, close_ns: int) -> None:
+    def consult(self, index: int, boundary: int, close_ns: int) -> None:
         """Pass the newest metrics to the controller, and stamp the probes that it wants."""
         watch, controller = self.watch, self.controller
         if self.evidence is not None:
@@ -546,11 +547,11 @@ def _evidence(
     problem: Problem, realisation: Realisation, arrays: CellArrays
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that extracts a window's evidence from the logs."""
-    flows = flow_rows(problem.pipeline)
+    logged = LoggedCycles(arrays, flow_rows(problem.pipeline))
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
-        rows = logged_window(arrays, first, last, flows)
-        return Evidence.of(rows, close_ns, realisation.release_ns[first:last].copy())
+        rows = logged.window(first, last)
+        return Evidence(close_ns, realisation.release_ns[first:last].copy(), rows)
 
     return cut
 

@@ -174,7 +174,12 @@ def phased(fleet: Fleet, seed: int) -> Iterator[Problem]:
     """Yield the problem of every cell, with its phase and the fleet's common warm-up."""
     warmup_ns = fleet.warmup_ns
     for cell, phase_ms in zip(fleet.cells, phases_ms(fleet, seed).values(), strict=True):
-        yield _phased(cell.problem, cell.problem.folder, phase_ms, warmup_ns)
+        yield at_phase(cell.problem, phase_ms, warmup_ns)
+
+
+def at_phase(problem: Problem, phase_ms: float, warmup_ns: int) -> Problem:
+    """Return a problem with a phase, and with a warm-up in whole windows."""
+    return _phased(problem, problem.folder, phase_ms, warmup_ns)
 
 
 # Cached because a capacity study uses one cell in many sizes, and a new problem is slow to check.
@@ -207,9 +212,14 @@ def _phase_ms(phases: Phases, cell: FleetCell, place: int, count: int, seed: int
     if phases == "even":
         return period_ms * place / count
     if phases == "random":
-        name = f"{cell.problem.name}-{cell.copy}/fleet-phase"
-        return period_ms * float(np.random.Generator(np.random.SFC64(stream(seed, name))).random())
+        return period_ms * _random_share(seed, f"{cell.problem.name}-{cell.copy}/fleet-phase")
     return 0.0
+
+
+# Cached because a capacity study asks for the phases of one cell in many sizes.
+@lru_cache(MOST_CELLS)
+def _random_share(seed: int, name: str) -> float:
+    return float(np.random.Generator(np.random.SFC64(stream(seed, name))).random())
 
 
 def priced_cells(fleet: Fleet, problems: Iterable[Problem]) -> list[PricedCell]:
@@ -221,7 +231,7 @@ def priced_cells(fleet: Fleet, problems: Iterable[Problem]) -> list[PricedCell]:
 def tabled_cells(fleet: Fleet, seed: int) -> list[PricedCell]:
     """Return the cells for the table of loads.
 
-    Random phases are replaced by even ones, which makes one table valid for all seeds.
+    Even phases replace random phases: one table is then valid for all seeds.
     """
     spread = fleet.changed(phases="even") if fleet.phases == "random" else fleet
     return priced_cells(spread, phased(spread, seed))
@@ -266,7 +276,7 @@ def coordinations(
     seed: int,
     progress: Progress | None = None,
 ) -> Iterator[Coordination | None]:
-    """Yield the coordination of each cell's moves; None without coordination."""
+    """Yield the coordination of each cell's moves, or None if cells move independently."""
     if fleet.coordination == "ledger":
         ledger = FleetLedger(
             priced_cells(fleet, problems.values()),
@@ -275,6 +285,7 @@ def coordinations(
             tabled=tabled_cells(fleet, seed),
             progress=progress,
             limit=fleet.limit,
+            moves=not fleet.is_static,
         )
     for i, cell in enumerate(fleet.cells):
         if fleet.coordination == "ledger":

@@ -140,7 +140,7 @@ class SimulatedGuard:
     def _tell_until(self, now: int) -> None:
         """Update the guard with the relevant events of an interval without orders.
 
-        In such an interval the order and the repetition of events have no effect.
+        Without orders, the order and the repetition of events have no effect.
         """
         guard, stamps = self.guard, self.arrays.tables.stamps
         stop = self._released(now)

@@ -84,7 +84,7 @@ class PlayedRealisation:
 
     @property
     def features(self) -> tuple[Feature, ...]:
-        """Optional features of the run, without those of its estimator."""
+        """Optional features of the run, except the features of its estimator."""
         return ("shadows",) if len(self.arrays.tables.cells) > 1 else ()
 
     def by_window(self, cycles: NDArray[T]) -> NDArray[T]:

@@ -11,7 +11,7 @@ from dwell.version import __version__
 
 
 def versions() -> dict[str, str]:
-    """Return versions by name; that of the kernel is the digest of its sources and its compiler.
+    """Return versions by name; the kernel's version has its compiler and a digest of its sources.
 
     Raises KernelError if the compiled kernel cannot be used.
     """

@@ -25,6 +25,7 @@ from dwell.sim.fleet import simulate_fleet, waiting_in_fleet
 from dwell.sim.static_fleet import StaticFleet
 from dwell.sim.waiting import Waiting
 from dwell.study.intervals import Interval, share_difference_interval, share_interval
+from dwell.study.metric import METRICS
 from dwell.study.played_sizes import KeptSizes, PlayedSize, Sizes, study_of
 from dwell.study.twins import with_twins
 from dwell.study.workers import available_processes, spread
@@ -213,7 +214,7 @@ class FleetPlayer:
         fleets = [self.of(size) for size in range(unit.first, unit.last + 1)]
         if self.fleet.is_static:
             static = StaticFleet(seed=unit.seed, duration_ns=self.duration_ns)
-            return [PlayedSize.of(*static.play(fleet)) for fleet in fleets]
+            return [PlayedSize.of(*run) for run in static.play_sizes(fleets)]
         return [self._moving(fleet, unit.seed) for fleet in fleets]
 
     def _moving(self, fleet: Fleet, seed: int) -> PlayedSize:
@@ -404,7 +405,9 @@ class _Sizes:
         """Return the capacity from the results so far, without `limits`."""
         names = dict.fromkeys(fleet.policy_of(entry) for entry in fleet.entries)
         robots, largest = self._largest(_value), max(self.played)
-        alone = f"one cell alone misses {self.alone:.0%} of its deadlines"
+        alone = (
+            f"one cell alone misses {METRICS['violation_rate'].text(self.alone)} of its deadlines"
+        )
         return Capacity(
             robots=robots,
             robots_at_limit=0 if self.alone > self.limit + ROUNDING else robots,

@@ -19,7 +19,8 @@ from dwell.errors import SimulationError
 from dwell.model.bounds import counted
 from dwell.model.number_arrays import Floats
 from dwell.study.intervals import CONFIDENCE
-from dwell.study.over_seeds import has_median, is_share, metric_values, windows_behind
+from dwell.study.metric import metric_of
+from dwell.study.over_seeds import metric_values, windows_behind
 from dwell.study.pairs import (
     PairedDifference,
     PairedMedian,
@@ -160,7 +161,7 @@ class Family:
         adjusted, verdicts, count = self.adjusted, self.verdicts, len(self.tested)
         rows = []
         for name, item in self.comparisons.items():
-            centre = "median" if has_median(self.metric) else "mean"
+            centre = "median" if metric_of(self.metric).values == "median" else "mean"
             known = {"difference": 0.0, "superiority": 0.5, "n": item.n}
             if not isinstance(item, SameRun):
                 centre = "mean" if isinstance(item, PairedDifference) else "median"
@@ -233,10 +234,11 @@ def _contrast(runs: pl.DataFrame, metric: str, pair: Contrast) -> Difference:
     word = played_alike(runs, pair)
     if word and np.array_equal(first, second):
         return SameRun(len(first), word)
-    if has_median(metric):
+    values = metric_of(metric).values
+    if values == "median":
         return paired_median(first, second)
     windows = windows_behind(*(_group(runs, labels) for labels in pair))
-    return paired_difference(first, second, shares=is_share(metric), windows=windows)
+    return paired_difference(first, second, shares=values == "share", windows=windows)
 
 
 def cannot_tell(seeds: int, comparisons: int = 1) -> str:

@@ -189,11 +189,11 @@ def best_placements(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[
     `alone` is J of every candidate of each cell without other cells.
     """
     if len(loads.resources) > 1:
-        return _by_program(loads, alone)
+        return by_program(loads, alone)
     return [*cheapest(loads, alone, [min(costs, key=costs.__getitem__) for costs in alone])]
 
 
-def _by_program(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
+def by_program(loads: Loads, alone: Sequence[Mapping[str, float]]) -> list[str]:
     """Return the best placements over several resources; every load is rounded up to a level.
 
     The program selects one candidate per cell and one level per resource. Each selected candidate

@@ -17,6 +17,7 @@ from dwell.study.intervals import (
     share_interval,
     share_limits,
 )
+from dwell.study.metric import metric_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -27,9 +28,6 @@ if TYPE_CHECKING:
 #: Column of runs with their independent unit, `WINDOW` or `RUN`.
 UNIT = "unit"
 WINDOW, RUN = "window", "run"
-
-#: Columns without negative values; utilisations have none either.
-NOT_NEGATIVE = frozenset({"cost", "j_still", "l95_ms", "migrations", "moved", "returns"})
 
 
 def over_seeds(
@@ -93,16 +91,6 @@ def windows_behind(*groups: pl.DataFrame) -> int | None:
     return min(int(runs["windows"].sum()) for runs in groups)
 
 
-def has_median(column: str) -> bool:
-    """Whether tables show the median of a column because its values may be infinite."""
-    return column in ("p95_ms", "p50_ms", "spread_ms") or column.startswith("tracking_")
-
-
-def is_share(column: str) -> bool:
-    """Whether a column of runs is a share of cycles or windows, in [0, 1]."""
-    return column == "violation_rate" or column.startswith(("share_", "over_"))
-
-
 def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], Interval]:
     """Return the function for the interval of a column: of a median if values may be infinite.
 
@@ -111,21 +99,20 @@ def interval_of(column: str, windows: int | None = None) -> Callable[[Floats], I
     windows : int, optional
         Windows behind the runs (see `windows_behind`); without them shares have wide intervals.
     """
-    if has_median(column):
-        return median_interval
-    if is_share(column):
-        return partial(share_interval, windows=windows)
-    return _not_negative if column in NOT_NEGATIVE or column.startswith("u_") else mean_interval
-
-
-def is_plain(column: str) -> bool:
-    """Whether a column has the interval of a plain mean."""
-    return interval_of(column) is mean_interval
+    match metric_of(column).values:
+        case "median":
+            return median_interval
+        case "share":
+            return partial(share_interval, windows=windows)
+        case "positive":
+            return _not_negative
+        case "any":
+            return mean_interval
 
 
 def difference_of(column: str, windows: int | None = None) -> Callable[[Floats, Floats], Interval]:
     """Return the function for the interval of a column's mean difference over pairs of runs."""
-    if is_share(column):
+    if metric_of(column).values == "share":
         return partial(share_difference_interval, windows=windows)
     return lambda first, second: mean_interval(first - second)
 

@@ -17,7 +17,7 @@ from dwell.model.bounds import counted
 from dwell.model.fleet import Fleet
 from dwell.model.problem import Drawn
 from dwell.model.semantics import nearest
-from dwell.study.over_seeds import is_plain
+from dwell.study.metric import declared
 from dwell.study.reference import CLAIRVOYANT, REFERENCES
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ class Study:
                 hint = nearest(path, self.parameters)
                 raise SimulationError(f"labels: {path!r} is none of the parameters; {hint}")
         for name in self.metrics:
-            if not is_plain(name):
+            if declared(name):
                 raise SimulationError(f"metrics.{name}: {TAKEN}")
         objects = [one.name for one in self.contenders if not isinstance(one.policy, str)]
         if objects and any(point.fleet is not None for point in self.points):

@@ -247,6 +247,17 @@ def _answer(windows: TableArrays, counts: Mask, missed: Mask) -> dict[str, float
     }
 
 
+def moves_of(run: Run, problem: Problem) -> dict[str, int]:
+    """Return only `migrations`, `returns` and `guard_moves` of a run's summary.
+
+    Raises
+    ------
+    SimulationError
+        If the run has no window after its warm-up.
+    """
+    return _migrations(run.arrays("decisions"), _counting(run, problem.window_cycles)[1])
+
+
 def _unfinished(outcomes: Names) -> dict[str, int]:
     """Count the lost cycles, and the cycles in flight at the end."""
     done, in_flight = (int(outcomes.equal(name).sum()) for name in ("done", "in_flight"))

@@ -10,6 +10,7 @@ from dwell.record import Run
 from dwell.study.independence import unit_of
 from dwell.study.intervals import share_interval, under
 from dwell.study.kept_bounds import AIM
+from dwell.study.metric import METRICS
 from dwell.study.over_seeds import WINDOW
 
 Word: TypeAlias = Literal["kept", "missed", "open"]
@@ -29,7 +30,7 @@ class RunVerdict:
     rate : float
         V_D of all counted cycles.
     low, high : float or None
-        95 % interval of the windows' mean; None if the windows are not independent.
+        95 % interval of the windows' mean; None if the windows are not independent or too few.
     aim : float
     """
 
@@ -40,11 +41,11 @@ class RunVerdict:
     aim: float
 
     def __str__(self) -> str:
-        interval = ""
+        metric, interval = METRICS["violation_rate"], ""
         if self.low is not None and self.high is not None:
-            interval = f" [{self.low * 100:.2f}, {self.high * 100:.2f}]"
+            interval = f" [{metric.number(self.low)}, {metric.number(self.high)}]"
         return (
-            f"{self.rate * 100:.2f} %{interval} of deadlines missed "
+            f"{metric.text(self.rate)}{interval} of {metric.wording} "
             f"(aim: under {self.aim * 100:g} %): {self.word}"
         )
 
@@ -69,5 +70,7 @@ def verdict_of(run: Run, problem: Problem, rate: float) -> RunVerdict:
         if unit_of(cells, len(windows["warmup"])) != WINDOW:
             return RunVerdict("open", rate, None, None, AIM)
     interval = share_interval(rates, windows=len(rates))
+    if not interval.known:
+        return RunVerdict("open", rate, None, None, AIM)
     word = _WORDS[under(rates, AIM, windows=len(rates))]
     return RunVerdict(word, rate, min(interval.low, rate), max(interval.high, rate), AIM)

@@ -22,7 +22,7 @@ import yaml
 
 import dwell
 from dwell.errors import OPTIONAL, LiveError, installing
-from dwell.live.commands.live_run import MARK, _ObservedRun
+from dwell.live.commands.live_run import MARK, ObservedRun
 from dwell.live.local.playing import crowded, make_folder
 from dwell.live.local.timeline import timeline_of
 from dwell.live.trust import KEYS
@@ -57,7 +57,7 @@ def problem() -> Problem:
 def test_a_run_is_told_what_was_played_and_when(problem: Problem, tmp_path: Path) -> None:
     folder = live_run(origin_ns=10 * PERIOD_NS).save(tmp_path / "run")
     timeline = timeline_of(problem, "demo", seed=5, seconds=100)
-    told = _ObservedRun(problem, "demo", 5, timeline)
+    told = ObservedRun(problem, "demo", 5, timeline)
     told.changed(timeline.changes[0], 20 * PERIOD_NS)
     run = told.note(folder, **told.observed(None))
     assert (run.meta["scenario"], run.meta["seed"]) == ("demo", 5)
@@ -89,7 +89,7 @@ def test_a_machine_that_was_full_while_nothing_disturbed_it_is_warned_of(
 
 def test_what_is_on_is_what_began_and_has_not_ended(problem: Problem) -> None:
     timeline = timeline_of(problem, "demo", seed=1, seconds=1_000)
-    told = _ObservedRun(problem, "demo", 1, timeline)
+    told = ObservedRun(problem, "demo", 1, timeline)
     seen = []
     for change in timeline.changes:
         told.changed(change)

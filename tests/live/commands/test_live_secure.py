@@ -39,7 +39,7 @@ class SecureCell(RealCell):
         code, told, error = invoke("keys", "init", self.file, "--out", self.keys)
         assert code == 0, error
         assert "dwell keys" not in error
-        assert "ca stays here" in told
+        assert "ca here" in told
         code, _, error = invoke("keys", "issue", self.keys, "watcher", "--role", "observer")
         assert code == 0, error
         # As on hosts of their own.

@@ -70,7 +70,7 @@ def test_lines_have_the_last_window_the_guard_and_a_silent_controller(
         state(30, status(4, placement="SO", guard_moves=1, fallback=True), [], answered_s=21)
     )
     placed, silent = capsys.readouterr().err.splitlines()
-    for part in ("SO  by the guard", "L95 31.2 ms", "V_D 2.5 %", "error 3.2 mm"):
+    for part in ("SO  by the guard", "L95 31.2 ms", "V_D 2.50 %", "error 3.2 mm"):
         assert part in placed, part
     assert "silent" not in placed
     assert "the controller is silent" in silent

@@ -17,7 +17,7 @@ from dwell.errors import LiveError, TrustError
 from dwell.live.host.security import INSECURE, Security
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.trust import KEYS
-from dwell.live.trust.authority import Authority, _general_name
+from dwell.live.trust.authority import Authority, general_name
 from dwell.live.trust.request import private_pem
 from dwell.live.trust.roster import Subject, write_private
 from dwell.live.wire.keys import Keys
@@ -155,7 +155,7 @@ def expired(authority: Authority, folder: Path, seconds: float = -60.0) -> Path:
     public = key.public_key().public_bytes(Encoding.Raw, PublicFormat.Raw)
     ends = datetime.now(UTC) + timedelta(seconds=seconds)
     subject = Subject("R2", "node", 1, 77, base64.b64encode(public).decode(), *LIFE)
-    made = authority._certificate(subject, key.public_key(), [_general_name("127.0.0.1")], ends)
+    made = authority.certificate_of(subject, key.public_key(), [general_name("127.0.0.1")], ends)
     write_private(folder / "key.pem", private_pem(key))
     write_private(folder / "cert.pem", made.public_bytes(Encoding.PEM))
     write_private(folder / "ca.pem", authority.certificate.public_bytes(Encoding.PEM))
@@ -209,10 +209,10 @@ def test_a_server_of_another_authority_is_not_spoken_to(
     port = free_ports(3)
     listen = {"control": Locator("127.0.0.1", port, "tls")}
     entry = WiringEntry(Role(STAMPER, "R1", "stamper"), listen, {})  # type: ignore[arg-type]
-    more = security(problem, other.folder, STAMPER)._settings(8)
+    more = security(problem, other.folder, STAMPER).settings(8)
     pretender = ZenohTransport(entry, more)
     try:
-        settings = security(problem, authority.folder, "agent@R2")._settings(8)
+        settings = security(problem, authority.folder, "agent@R2").settings(8)
         end = {"control": (Locator("127.0.0.1", port, "tls"),)}
         agent = ZenohTransport(WiringEntry(Role("agent@R2", "R2", "agent"), {}, end), settings)  # type: ignore[arg-type]
         try:

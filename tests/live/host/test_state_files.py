@@ -15,7 +15,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
-from dwell.live.host.state_files import BookFile, HighestFile, InFlight, boot_id, make_folder
+from dwell.live.host.state_files import (
+    BeatFiles,
+    BookFile,
+    HighestFile,
+    InFlight,
+    boot_id,
+    make_folder,
+)
 from dwell.live.roles.stamper import StamperState
 from dwell_lab.chaos.disk import SmallDisk, may_mount
 
@@ -195,3 +202,28 @@ def test_a_file_that_was_removed_is_there_again_after_the_next_write(tmp_path: P
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel tells no boot")
 def test_the_boot_has_an_id() -> None:
     assert boot_id() == boot_id() != ""
+
+
+def test_processes_of_a_node_read_each_others_beats(tmp_path: Path) -> None:
+    agent, worker = BeatFiles(tmp_path, "agent@E"), BeatFiles(tmp_path, "planning@E")
+    assert agent.read("planning@E") == b""
+    for beat in (b"first", b"second", b"a longer third"):
+        worker.write(beat)
+        assert agent.read("planning@E") == beat
+    # It outlives its process.
+    assert BeatFiles(tmp_path, "planning@E").read("planning@E") == b"a longer third"
+    worker.write(bytes(100_000))
+    assert agent.read("planning@E") == b"a longer third"
+
+
+def test_beats_find_each_other_after_their_folder_was_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "state"
+    folder.mkdir()
+    agent, worker = BeatFiles(folder, "agent@E"), BeatFiles(folder, "planning@E")
+    worker.write(b"before")
+    assert agent.read("planning@E") == b"before"
+    shutil.rmtree(folder)
+    worker.write(b"without a folder")
+    folder.mkdir()
+    worker.write(b"after")
+    assert agent.read("planning@E") == b"after"

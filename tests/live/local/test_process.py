@@ -20,7 +20,7 @@ from dwell.live.local.process import FaultyPlatform, main, program
 from dwell.live.local.processes import Processes
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.wire.keys import Keys
-from dwell.live.wire.messages import Beat, decode
+from dwell.live.wire.messages import Beats, decode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import wire
 from dwell_lab.chaos.wiretap import entry_for
@@ -69,8 +69,8 @@ def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:
 
     def hear(sample: Arrival) -> None:
         source, _ = without_source(sample.header)
-        beat = decode(sample.payload, Beat)
-        heard[beat.who] = source, beat.sent_ns - time.monotonic_ns()
+        for beat in decode(sample.payload, Beats).beats:
+            heard[beat.who] = source, beat.sent_ns - time.monotonic_ns()
 
     links, clocks = tmp_path / "links", tmp_path / "clocks"
     with (
@@ -82,7 +82,7 @@ def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:
         processes.write()
         transport = ZenohTransport(entry_for(wire(problem), ["R1"]))
         try:
-            transport.subscribe(Keys(problem.name).beat("*", "*"), hear)
+            transport.subscribe(Keys(problem.name).beats("*"), hear)
             processes.start_agent("R1")
             until_s = time.monotonic() + 60
             while not {"agent@R1", "stamper@R1", "sensing@R1"} <= heard.keys():

@@ -162,21 +162,22 @@ def test_what_is_not_moved_has_no_lead(problem: Problem) -> None:
 def test_what_else_is_due_comes_between_an_order_and_its_record(problem: Problem) -> None:
     world, events = alternating(problem), list[str]()
     cell, recorder = world.cell, world.recorder
-    wake, send, append = cell.wake, cell._send, recorder.append
+    wake, append = cell.wake, recorder.append
 
     def woken(now_ns: int) -> int:
         events.append("wake")
         return wake(now_ns)
 
-    def sent(order: Order) -> None:
-        events.extend(["order"] if order.placement else [])
-        send(order)
+    def hear(sample: Arrival) -> None:
+        if sample.key == world.keys.order() and decode(sample.payload, Order).placement:
+            events.append("order")
 
     def appended(rows: Rows, **meta: object) -> None:
         events.extend(["record"] if rows["windows"] else [])
         append(rows, **meta)
 
-    cell.wake, cell._send = woken, sent  # type: ignore[method-assign]
+    cell.wake = woken  # type: ignore[method-assign]
+    world.network.taps.append(hear)
     recorder.append = appended  # type: ignore[method-assign]
     world.run(8_000)
     orders = [place for place, event in enumerate(events) if event == "order"]
@@ -232,15 +233,14 @@ def test_an_order_that_was_asked_for_anew_before_its_answer_came_is_no_move_of_t
 def test_an_order_that_is_refused_for_now_is_asked_for_anew(problem: Problem) -> None:
     world = alternating(problem)
     world.run(3_000)
-    cell, numbers = world.cell, list[int]()
-    send = cell._send
+    numbers = list[int]()
 
-    def sent(order: Order) -> None:
-        send(order)
-        if order.placement:
-            numbers.append(order.number)
+    def hear(sample: Arrival) -> None:
+        if sample.key == world.keys.order():
+            order = decode(sample.payload, Order)
+            numbers.extend([order.number] if order.placement else [])
 
-    cell._send = sent  # type: ignore[method-assign]
+    world.network.taps.append(hear)
     world.kill("perception@E")
     world.run(2_000)
     # The stamper answers an order that it has answered as it did before.
@@ -276,7 +276,7 @@ def test_an_order_that_comes_after_the_guards_move_has_not_brought_it_about(
     assert world.stamper.placement == "SO"
     world.network.cut("stamper@R1", "*", key="dwell/*/accepted")
     world.network.cut("agent@E", "*", key="dwell/*/gathered")
-    world.stamper._move("LOC", by_guard=True)
+    world.move_by_guard("LOC")
     world.run(400)
     cell = world.cell
     assert (cell.course.term, cell.course.placement) == (world.stamper.term, "LOC")
@@ -289,8 +289,10 @@ def test_what_nobody_wants_any_more_is_probed_no_longer(problem: Problem) -> Non
     world.run(2_000)
     stamper = world.stamper
     stamper.guard.adopt(stamper.placement, fallback=True)
-    for number, want in enumerate(("SO", "SO", "", "HYB", "no candidate"), stamper._newest + 1):
-        stamper._accept(Order(number, "other", stamper.run, stamper.term, want=want))
+    for number, want in enumerate(
+        ("SO", "SO", "", "HYB", "no candidate"), stamper.newest_order + 1
+    ):
+        world.answer(Order(number, world.cell.name, stamper.run, stamper.term, want=want))
         assert stamper.guard.probation.wanted == (want if want in problem.candidates else None)
 
 

@@ -32,12 +32,14 @@ def test_a_second_copy_and_ones_own_beat_are_no_news() -> None:
 def test_what_came_over_the_detour_is_not_said_to_be_heard_directly() -> None:
     detector = FailureDetector("arm@R2", 100 * MS)
     detector.hear(beat(5), 10 * MS, direct=False)
-    assert detector.heard() == ()
+    assert detector.heard(11 * MS) == ()
     assert detector.hear(beat(5), 11 * MS), "its direct copy is news of the direct way"
     ((who, node, sent_ns, at_ns),) = [
-        (one.who, one.node, one.beat_ns, one.at_ns) for one in detector.heard()
+        (one.who, one.node, one.beat_ns, one.at_ns) for one in detector.heard(12 * MS)
     ]
     assert (who, node, sent_ns, at_ns) == ("plan@E", "E", 5 * MS, 11 * MS)
+    # It stays out of later beats: nothing is known of the link then.
+    assert detector.heard(212 * MS) == ()
 
 
 def test_who_starts_anew_is_heard_at_once() -> None:

@@ -60,7 +60,7 @@ def test_a_process_of_another_cell_file_is_shown_by_the_controller(problem: Prob
     # Its candidates may be others of the same names: it is ordered nothing.
     before = world.stamper.term
     world.pin("SO")
-    assert cell._move is not None  # type: ignore[attr-defined]
+    assert cell.status(world.network.now_ns)["moving_to"] == "SO"  # type: ignore[attr-defined]
     assert world.stamper.term == before
 
 

@@ -127,6 +127,8 @@ def test_a_killed_worker_loses_what_waited_for_it(problem: Problem) -> None:
     world = World(cell, policy="SO", exec_ms={**EXEC_MS, "perception": 90.0})
     for _ in looks(world, COUNTED_MS / 1e3):
         pass
+    while queued(world.worker("perception@E"))[0] < 5:
+        world.run(1)
     world.kill("perception@E")
     world.start("perception@E")
     lost = [status["flows"][IMAGES]["lost"] for status in looks(world, COUNTED_MS / 1e3)]

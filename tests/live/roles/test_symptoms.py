@@ -77,7 +77,7 @@ def test_shadows_of_long_ago_say_nothing(problem: Problem) -> None:
     # Nobody orders any more of them.
     world.network.cut("controller@E", "stamper@R1")
     world.run(10)
-    world.stamper._fraction = 0.0
+    world.stamper.shadow_fraction = 0.0
     world.run(3 * 20 * cell.pipeline.period_ms)
     assert symptoms(world)["failing"] == {}
 

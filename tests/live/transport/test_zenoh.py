@@ -18,12 +18,12 @@ import pytest
 from dwell.errors import LiveError
 from dwell.live.transport.zenoh import (
     POOL_BYTES,
+    KeyRoute,
+    PatientSender,
+    PayloadPool,
     ZenohSettings,
     ZenohTransport,
-    _mark,
-    _Pool,
-    _Route,
-    _Sender,
+    mark_of,
 )
 from dwell.live.wire.transport import Arrival, Lane, Transport
 from dwell.live.wire.wiring import Locator, Role, WiringEntry
@@ -125,12 +125,12 @@ def test_a_frozen_process_costs_the_others_nothing(mesh: ZenohMesh) -> None:
 def test_of_large_payloads_that_wait_the_newest_are_sent() -> None:
     begun, go_on, sent = threading.Event(), threading.Event(), Queue[bytes]()
 
-    def send(way: _Route, content: bytes, header: bytes) -> None:
+    def send(way: KeyRoute, content: bytes, header: bytes) -> None:
         begun.set()
         assert go_on.wait(PATIENCE_S)
         sent.put(content + header)
 
-    sender = _Sender(_Route(print, None), send)
+    sender = PatientSender(KeyRoute(print, None), send)
     sender.send(b"1", b"a")
     assert begun.wait(PATIENCE_S)  # it is on its way, and hangs
     for number in (b"2", b"3", b"4", b"5"):
@@ -217,7 +217,7 @@ def test_a_process_without_sessions_for_images_sends_them_the_other_way(mesh: Ze
 
 
 def test_a_full_pool_falls_back_to_a_copy() -> None:
-    pool = _Pool.of(1 << 20)
+    pool = PayloadPool.of(1 << 20)
     assert pool is not None
     payload = bytes(range(256)) * 1_024
     held = [pool.filled(payload) for _ in range(8)]
@@ -230,13 +230,13 @@ def test_a_full_pool_falls_back_to_a_copy() -> None:
 
 
 def test_no_pool_where_there_is_no_room_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert _Pool.of(1 << 50) is None
+    assert PayloadPool.of(1 << 50) is None
     monkeypatch.setattr("dwell.live.transport.zenoh.SHARED_MEMORY", "/nowhere/at/all")
-    assert _Pool.of() is None
+    assert PayloadPool.of() is None
 
 
 def test_a_user_who_may_lock_little_memory_sends_through_sockets() -> None:
-    code = "from dwell.live.transport.zenoh import _Pool; print(_Pool.of())"
+    code = "from dwell.live.transport.zenoh import PayloadPool; print(PayloadPool.of())"
     command = ["prlimit", "--memlock=1000000", sys.executable, "-c", code]
     if os.geteuid() == 0:  # whom no limit holds
         command[2:2] = ["setpriv", "--bounding-set=-ipc_lock"]
@@ -324,7 +324,7 @@ def test_what_was_put_under_another_key_is_not_heard() -> None:
         receiver.subscribe(key, inbox)
         introduce(mesh, sender, key, [inbox])
         way = sender._routes[key, "control"]
-        own, way.mark = way.mark, _mark("dwell/t/order")
+        own, way.mark = way.mark, mark_of("dwell/t/order")
         sender.put(key, b"misled", b"header")
         # What carries no mark is of others, who may put what they may put.
         way.mark = b""

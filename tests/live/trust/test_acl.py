@@ -108,7 +108,7 @@ def test_whatever_a_cell_says_may_be_said(
     said = said_in(problem, 200, monkeypatch)
     assert {who for who, _ in said} == {role.who for role in roles(problem)}
     assert {key.split("/")[2] for _, key in said} == {
-        *("in", "sink", "done", "beat", "relay", "carried", "gathered", "load", "ended"),
+        *("in", "sink", "done", "beat", "beats", "relay", "carried", "gathered", "load", "ended"),
         *("order", "accepted", "stamped", "snapshot", "state", "restored", "answer"),
     }
     denied = {(who, key) for who, key in said if not wall.lets(subject_of(problem, who), key)}

@@ -80,7 +80,7 @@ def test_the_certificate_before_holds_until_it_ends(
     assert {"R1.1", "R1.2"} == set(everybody["policies"][1]["subjects"])
     # Those that have ended are not listed any more.
     later = datetime.now(UTC) + timedelta(days=400)
-    monkeypatch.setattr("dwell.live.trust.authority._now", lambda: later)
+    monkeypatch.setattr("dwell.live.trust.authority.now", lambda: later)
     Authority.open(authority.folder).issue("R1", days=3_000)
     assert [one.generation for one in Authority.open(authority.folder).roster.of("R1")] == [3]
 
@@ -145,7 +145,7 @@ def test_an_expired_certificate_is_refused(
     authority: Authority, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     long_ago = datetime.now(UTC) - timedelta(days=400)
-    monkeypatch.setattr("dwell.live.trust.authority._now", lambda: long_ago)
+    monkeypatch.setattr("dwell.live.trust.authority.now", lambda: long_ago)
     folder = authority.issue("R1", "node")
     with pytest.raises(TrustError, match=r"has expired on .*; issue another"):
         Keyring.open(folder)

@@ -38,6 +38,7 @@ def test_who_may_put_what_in_the_canonical_cell(problem: Problem) -> None:
         "done/control": {"R2"},
         "ended": {*robots, "E"},
         "stamped": {"R1"},
+        "missed": {"R1"},
         "accepted": {"R1"},
         "order": {CONTROLLER},
         "answer/*": {CONTROLLER},
@@ -53,7 +54,7 @@ def test_who_may_put_what_in_the_canonical_cell(problem: Problem) -> None:
             for source in nodes - {node}:
                 expected[f"state/{task}/{node}/{source}"] = {source}
     for node in ("R1", "E", "R2"):
-        expected[f"load/{node}"] = {node}
+        expected[f"load/{node}"] = expected[f"beats/{node}"] = {node}
     for role in roles(problem):
         sender = CONTROLLER if role.kind == "controller" else role.node
         expected[f"beat/{role.node}/{role.who}"] = {sender}

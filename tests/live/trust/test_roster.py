@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,7 +28,8 @@ def test_no_changed_roster_is_accepted(
     text[int(where * len(text))] ^= change
     before = json.loads(path.read_bytes())
     path.write_bytes(bytes(text))
-    key = authority._key.public_key()
+    key = authority.certificate.public_key()
+    assert isinstance(key, Ed25519PublicKey)
     try:
         found = Roster.read(path, key)
     except TrustError:

@@ -22,6 +22,7 @@ from dwell.live.wire.messages import (
     SIGNATURE_BYTES,
     Accepted,
     Beat,
+    Beats,
     Carried,
     Completion,
     Header,
@@ -34,6 +35,7 @@ from dwell.live.wire.messages import (
     encode,
 )
 from dwell.live.wire.transport import Arrival
+from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from dwell.model.document import digests
 from tests.live.memory_transport import MemoryTransport
@@ -158,6 +160,7 @@ def test_every_small_message_that_matters_is_signed(
         "accepted": Accepted,
         "done": Completion,
         "beat": Beat,
+        "beats": Beats,
         "load": Load,
     }
     for word, kind in kinds.items():
@@ -234,7 +237,6 @@ def test_a_replayed_order_moves_nothing(world: World, seals: dict[str, Seals]) -
     for replayed in (there, back, there, there, back):
         assert give(world, replayed) == 0
     assert (world.stamper.term, world.stamper.moves) == (term, moves)
-    assert world.stamper._answered is not None
 
 
 def test_replayed_settings_do_not_come_back(world: World, seals: dict[str, Seals]) -> None:
@@ -244,10 +246,10 @@ def test_replayed_settings_do_not_come_back(world: World, seals: dict[str, Seals
     old = order_of(world, "", number, shadow_fraction=0.5, forks=forks)
     new = order_of(world, "", number + 1, shadow_fraction=0.25)
     assert give(world, ordered(world, old, seals[CONTROLLER])) == 0
-    assert (world.stamper._fraction, world.stamper._forks) == (0.5, forks)
+    assert (world.stamper.shadow_fraction, world.stamper.forks) == (0.5, forks)
     assert give(world, ordered(world, new, seals[CONTROLLER])) == 0
     assert give(world, ordered(world, old, seals[CONTROLLER])) == 0
-    assert (world.stamper._fraction, world.stamper._forks) == (0.25, ())
+    assert (world.stamper.shadow_fraction, world.stamper.forks) == (0.25, ())
 
 
 def test_a_controller_whose_clock_is_behind_learns_the_numbers(
@@ -259,9 +261,9 @@ def test_a_controller_whose_clock_is_behind_learns_the_numbers(
     assert give(world, ordered(world, far, seals[CONTROLLER])) == 0
     world.run(3_000)
     cell = world.cell
-    assert cell._number > 1 << 61
-    assert world.stamper._newest > 1 << 61
-    assert world.stamper._fraction == cell.controller.shadow_fractions["SO"]
+    assert cell.order_number > 1 << 61
+    assert world.stamper.newest_order > 1 << 61
+    assert world.stamper.shadow_fraction == cell.controller.shadow_fractions["SO"]
 
 
 def test_orders_in_any_order_end_where_the_last_says(
@@ -275,7 +277,7 @@ def test_orders_in_any_order_end_where_the_last_says(
         for n, f in enumerate(fractions, 1)
     ]
     give(world, *[sealed[i] for i in (2, 0, 3, 1, 2, 0)])
-    assert world.stamper._fraction == 0.4
+    assert world.stamper.shadow_fraction == 0.4
 
 
 # --------------------------------------------------------------------------- completions
@@ -408,6 +410,64 @@ def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]
     for sealed in (seals["E"].seal("beat", later), seals["R2"].seal("beat", later)):
         assert give(world, carried(world, (keys.beat("E", "perception@E"), sealed))) == 1
     assert world.stamper.pulse.detector.last(who) == before
+
+
+def beats_of(world: World, node: str, *names: str, **more: object) -> Arrival:
+    """Beats of some processes, as the agent of a node sends them."""
+    nodes = {role.who: role.node for role in roles(world.problem)}
+    beats = tuple(beat_of(world, who, nodes[who], **more) for who in names)
+    return Arrival(world.keys.beats(node), encode(Beats(beats)))
+
+
+def sealed(arrival: Arrival, seals: Seals) -> Arrival:
+    return Arrival(arrival.key, seals.seal("beats", arrival.payload))
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ("agent@R2", "perception@E"),  # a process of another node
+        ("agent@E", "perception@E"),  # another node
+        ("control@R2",),  # not from its agent
+        ("agent@R2", "controller@E"),
+    ],
+)
+def test_an_agent_speaks_for_its_own_node_alone(
+    world: World, seals: dict[str, Seals], names: tuple[str, ...]
+) -> None:
+    """Its key can claim what the processes of its node together could claim."""
+    last = world.stamper.pulse.detector.last
+    before = {who: last(who) for who in names}
+    forged = sealed(beats_of(world, "R2", *names, ready=False), seals["R2"])
+    for sample in (carried(world, (forged.key, forged.payload)), forged):
+        assert give(world, sample) == 1
+    assert {who: last(who) for who in names} == before
+    good = sealed(beats_of(world, "R2", "agent@R2", "control@R2", ready=False), seals["R2"])
+    assert give(world, good) == 0
+    assert last("control@R2") != before.get("control@R2", last("agent@R2"))
+
+
+def test_an_agent_does_not_speak_for_the_controller_on_its_node(
+    world: World, seals: dict[str, Seals]
+) -> None:
+    """They share a computer, and no key."""
+    last = world.stamper.pulse.detector.last
+    before = last("controller@E")
+    forged = sealed(beats_of(world, "E", "agent@E", "controller@E", ready=False), seals["E"])
+    assert give(world, forged) == 1
+    assert last("controller@E") == before
+
+
+def test_a_relay_cannot_make_the_beats_of_a_node_up(world: World, seals: dict[str, Seals]) -> None:
+    last = world.stamper.pulse.detector.last
+    before = last("control@R2")
+    beats = beats_of(world, "R2", "agent@R2", "control@R2", ready=False)
+    for forged in (beats, sealed(beats, seals["E"])):
+        assert give(world, carried(world, (forged.key, forged.payload))) == 1
+    assert last("control@R2") == before
+    true = sealed(beats, seals["R2"])
+    assert give(world, carried(world, (true.key, true.payload))) == 0
+    assert last("control@R2") != before
 
 
 # ----------------------------------------------------------------------- the controller's

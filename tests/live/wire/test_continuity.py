@@ -85,7 +85,7 @@ def completed(world: World, outcome: str = "actuated", **false: object) -> None:
 def answered(world: World, **false: object) -> None:
     """The controller hears one answer that is as the next would be, but for what is false."""
     stamper, cell = world.stamper, world.cell
-    number, name = cell._number, cell.name
+    number, name = cell.order_number, cell.name
     true = Accepted(number, name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle)
     hear(world, world.keys.accepted(), msgspec.structs.replace(true, **false))
 
@@ -266,7 +266,7 @@ def test_a_guards_move_is_told_by_stamps_where_no_answer_comes(world: World) -> 
     world.network.cut("agent@E", "*", key="dwell/*/gathered")
     stamper = world.stamper
     other = next(name for name in world.problem.candidates if name != stamper.placement)
-    stamper._move(other, by_guard=True)
+    world.move_by_guard(other)
     world.run(400)
     assert world.status["placement"] == other
     assert world.status["guard_moves"] == 1
@@ -352,7 +352,7 @@ def test_late_beats_over_the_detour_are_no_news() -> None:
 
 
 def test_a_false_completion_stops_no_intervals() -> None:
-    intervals = Intervals("stamper@R1", {"arm"})
+    intervals = Intervals("R1", {"arm"})
     intervals.hear(
         Beat("sink.arm@R2", "R2", 1, 20 * MS, True, (Heard("stamper@R1", "R1", 0, 10 * MS),)),
         14 * MS,

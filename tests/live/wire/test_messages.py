@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dwell.errors import LiveError
 from dwell.live.roles.role import MAX_COMPLAINTS, MAX_STRANGERS, Pulse
-from dwell.live.roles.worker import MAX_JOINS
+from dwell.live.roles.worker import MAX_JOINS, Worker
 from dwell.live.stage import Message
 from dwell.live.wire.messages import (
     MAX_CONTROL_BYTES,
@@ -39,6 +39,7 @@ from tests.live.small_world import (
     Passing,
     World,
     canonical,
+    queued,
     stateful,
 )
 
@@ -209,7 +210,7 @@ def test_no_role_falls_over_what_nobody_meant(world: World, data: st.DataObject)
             worker = role.worker
             while (chore := worker.next_chore(now_ns)) is not None:
                 worker.finish_chore(chore, *worker.do_chore(chore), now_ns, now_ns)
-            assert not worker._jobs, f"{who} would call its stage"
+            assert not queued(worker)[0], f"{who} would call its stage"
     assert calls == []
 
 
@@ -288,9 +289,10 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
             known = {name for name, _, _ in pulse.detector.everybody(now_ns)}
             assert known <= set(world.roles) | {"controller@E"}
     for _, role in roles_of(world):
-        if hasattr(role, "_jobs"):
-            assert len(role._jobs) <= 10 * MAX_JOINS
-            assert all(len(joins.waiting) <= MAX_JOINS for joins in role._joins.values())
+        if isinstance(role, Worker):
+            jobs, _, joins = queued(role)
+            assert jobs <= 10 * MAX_JOINS
+            assert max(joins, default=0) <= MAX_JOINS
             assert len(role.routes._known) <= MAX_KNOWN
 
 

@@ -23,7 +23,7 @@ class Seen:
     what : int
         `APPLY`, `HOLD`, `ZERO`, or `START` of its process.
     placement : str
-        Candidate of the light cell whose nodes the command names; ``?`` if there is none.
+        Candidate of the light cell whose nodes the command names; ``?`` for other nodes.
     cycle : int
         Cycle number that the runtime passed.
     said : int

@@ -155,7 +155,7 @@ class DiskHog(Started):
 
     @property
     def wait_ms(self) -> float:
-        """Median wait for a page; 0 if there was none."""
+        """Median wait for a page in ms; 0 before the first page."""
         return statistics.median(self.waits_ms) if self.waits_ms else 0.0
 
     def _measure(self) -> None:

@@ -220,7 +220,7 @@ class Judge:
     def ordered_since(self, at_ns: int) -> int | None:
         """Return the instant of the first stamp since `at_ns` whose placement was ordered.
 
-        The first placement of a run counts as ordered. None if there is no such stamp yet.
+        The first placement of a run counts as ordered. None before the first such stamp.
         """
         instants = [
             self.stamped_ns[cycle]

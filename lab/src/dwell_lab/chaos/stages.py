@@ -106,7 +106,7 @@ class Control(_Timed):
 
 
 class Witness(CellActuator):
-    """Actuator that appends one record per call, each in one write, so that a kill cannot split it.
+    """Actuator that appends one record per call, in one write: a kill cannot split it.
 
     Parameters
     ----------

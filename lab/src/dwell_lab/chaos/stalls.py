@@ -13,7 +13,7 @@ from dwell.live.local.child import Started
 class StallDetector(Started):
     """Context manager with one thread per CPU that records when it was scheduled too late.
 
-    The cell's processes have the same priority: if such a thread is late, they are late as well.
+    The cell's processes have the same priority: if a thread here is late, they are late as well.
     """
 
     STEP_S = 0.004

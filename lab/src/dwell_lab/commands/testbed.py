@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,9 +25,13 @@ from dwell.cli.options import (
 from dwell.cli.output import aligned, file_name, print_json
 from dwell.errors import ExitCode
 from dwell.live.log import say
+from dwell.model.table_columns import USE_OF
 from dwell_lab.commands.campaign import campaign
 from dwell_lab.commands.chaos import chaos
 from dwell_lab.commands.lengths import seconds_of_runs
+
+if TYPE_CHECKING:
+    from dwell.study.metric import Metric
 
 testbed = typer.Typer(
     no_args_is_help=True,
@@ -99,20 +103,20 @@ def _sum_up(folder: Path, *, as_json: bool) -> None:
         raise typer.Exit(ExitCode.FAILED)
 
 
-def _lines(totals: dict[str, Any]) -> str:
-    def number(value: float | None, scale: float, unit: str) -> str:
-        return "-" if value is None else f"{scale * value:.1f} {unit}"
+def _text(metric: Metric, value: float | None) -> str:
+    return "-" if value is None else metric.text(value)
 
+
+def _lines(totals: dict[str, Any]) -> str:
+    from dwell.study.metric import METRICS, metric_of
+
+    shown = (METRICS[name] for name in ("l95_ms", "violation_rate", "migrations"))
+    used = {USE_OF.format(resource=name): use for name, use in totals["utilisation"].items()}
     rows = [
         ("windows after the warm-up", str(totals["windows"])),
         ("excluded: the machine was the bottleneck", str(totals["excluded"])),
-        ("L95, mean of windows", number(totals["l95_ms"], 1.0, "ms")),
-        ("missed deadlines (V_D)", number(totals["violation_rate"], 100.0, "%")),
-        ("migrations", str(totals["migrations"])),
-    ]
-    rows += [
-        (f"utilisation of {node}", number(used, 100.0, "%"))
-        for node, used in totals["utilisation"].items()
+        *((metric.title, _text(metric, totals[metric.column])) for metric in shown),
+        *((metric_of(column).title, _text(metric_of(column), use)) for column, use in used.items()),
     ]
     return aligned(("", ""), rows).lstrip("\n")
 

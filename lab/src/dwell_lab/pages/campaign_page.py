@@ -7,15 +7,17 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from dwell.display import Measure, write_number
 from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, cumulative
 from dwell.report.figure import Figure
-from dwell.report.formatting import Measure, percent, shown_contender, write_number
+from dwell.report.formatting import percent, shown_contender
 from dwell.report.page import Block, Fact, Page, Section, page_html
 from dwell.report.palette import ramp_styles
-from dwell.report.policy_blocks import MEASURES, PolicyBlocks, named
+from dwell.report.policy_blocks import PolicyBlocks, named
 from dwell.report.table import Columns, Table, Text, table_text
 from dwell.study.family import UNTOLD, untold
+from dwell.study.metric import METRICS
 from dwell_lab.validation.campaign_questions import CampaignQuestion, questions
 from dwell_lab.validation.measured_campaign import MeasuredCampaign
 
@@ -23,7 +25,8 @@ from dwell_lab.validation.measured_campaign import MeasuredCampaign
 POINTS = 80
 #: Upper end of an axis of latencies, in deadlines.
 DEADLINES = 4
-SHOWN = {one.column: one for one in MEASURES if one.column not in ("cost", "migrations")}
+#: Metrics of windows.
+SHOWN = ("violation_rate", "l95_ms", "u_robot", "u_edge")
 WHERE = {"testbed": "the testbed"}
 
 
@@ -68,8 +71,7 @@ def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Sect
     yield Section("Results", [blocks.results()])
     figures: list[Block] = [blocks.tail()]
     figures += [
-        blocks.measure(SHOWN[name], title=f"{SHOWN[name].name}, utilisation of the busiest node")
-        for name in ("u_robot", "u_edge")
+        blocks.measure(METRICS[name], title=METRICS[name].title) for name in ("u_robot", "u_edge")
     ]
     yield Section("Figures", [*figures, blocks.distribution(), *blocks.placed(), blocks.split()])
     yield Section(
@@ -100,11 +102,10 @@ def _sections(measured: MeasuredCampaign, blocks: PolicyBlocks) -> Iterator[Sect
 
 
 def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -> Table:
-    measures = {measure.column: measure for measure in MEASURES}
     rows = []
     once = untold(asked.table["word"])
     for row in asked.table.iter_rows(named=True):
-        measure = measures[row["metric"]]
+        measure = METRICS[row["metric"]]
         effect = {"effect": row["effect"], "effect_low": row["low"], "effect_high": row["high"]}
         scaled = {key: one if one is None else measure.factor * one for key, one in effect.items()}
         word = UNTOLD if row["word"] in once else row["word"]
@@ -118,7 +119,7 @@ def _question_table(asked: CampaignQuestion, blocks: PolicyBlocks, place: int) -
             Text("first", "policy", "policy"),
             Text("second", "less", "policy"),
             Measure("effect", "difference", decimals=2, signed=True),
-            Measure("n", "repetitions", decimals=0),
+            Measure("n", "repetitions"),
             Measure("p", "p (Holm)", decimals=3),
             Measure("p_least", "least p", decimals=3),
             Text("word", "is", "word"),
@@ -135,7 +136,7 @@ def _windows(measured: MeasuredCampaign, blocks: PolicyBlocks, name: str) -> Fig
     """Draw the distributions of a measure over windows."""
     import polars as pl
 
-    measure, deadline_ms = SHOWN[name], measured.comparison.problem.pipeline.deadline_ms
+    measure, deadline_ms = METRICS[name], measured.comparison.problem.pipeline.deadline_ms
     latency = name == "l95_ms"
     every = measured.windows[name].to_numpy() * measure.factor
     high = float(every.max())
@@ -160,8 +161,8 @@ def _profiles(measured: MeasuredCampaign) -> Table:
     columns: Columns = [
         Text("task", "task"),
         Text("node", "node"),
-        Measure("jobs", "jobs", decimals=0),
-        Measure("runs", "runs", decimals=0),
+        Measure("jobs", "jobs"),
+        Measure("runs", "runs"),
     ]
     for kind in times:
         columns += [
@@ -192,7 +193,7 @@ def _links(measured: MeasuredCampaign) -> Table:
     columns: Columns = [
         Text("link", "link"),
         Text("flow", "flow"),
-        Measure("messages", "messages", decimals=0),
+        Measure("messages", "messages"),
         Measure("mean_ms", "mean", "ms", decimals=2),
         Measure("std_ms", "std", "ms", decimals=2),
         Measure("p50_ms", "median", "ms", decimals=2),
@@ -221,14 +222,14 @@ def _log(measured: MeasuredCampaign) -> Table:
     columns: Columns = [
         Text("place", "run"),
         Text("begun", "begun (UTC)"),
-        Measure("repetition", "repetition", decimals=0),
+        Measure("repetition", "repetition"),
         Text("scenario", "scenario", "scenario"),
         Text("policy", "policy", "policy"),
-        Measure("attempt", "attempt", decimals=0),
+        Measure("attempt", "attempt"),
         Text("idle", "machine idle before"),
         Measure("waited_s", "waited for that", "s"),
-        Measure("windows", "windows", decimals=0),
-        Measure("excluded", "excluded", decimals=0),
+        Measure("windows", "windows"),
+        Measure("excluded", "excluded"),
     ]
     return Table("log", "Runs", columns, rows)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.display import Measure, write_number
 from dwell.model.bounds import counted
 from dwell.report.charts import (
     NO_LIMIT,
@@ -25,13 +26,14 @@ from dwell.report.charts import (
     stacked,
 )
 from dwell.report.figure import Figure, Spec
-from dwell.report.formatting import Measure, percent, shown_contender, shown_scenario, write_number
+from dwell.report.formatting import percent, shown_contender, shown_scenario
 from dwell.report.method import cell_definitions
 from dwell.report.move_blocks import move_blocks
 from dwell.report.page import Definitions, Page, Section, page_html
 from dwell.report.palette import DASHES, INK, MUTED, SHADE, Palette, Style
 from dwell.report.policy_blocks import named
 from dwell.report.table import Columns, Row, Table, Text, interval_row, table_text
+from dwell.study.metric import METRICS
 from dwell_lab.validation.judged_prediction import (
     L95_ALLOWED,
     ORDER,
@@ -154,12 +156,9 @@ def _table(
     return Table(slug, title, [POLICY, *columns], rows, SCENARIO, caption, palette)
 
 
-def _pair(
-    column: str, name: str, unit: str, factor: float = 1.0, decimals: int = 1
-) -> list[Measure]:
+def _pair(measured: Measure) -> list[Measure]:
     """Return the two columns of a quantity: measured and predicted."""
-    measured = Measure(column, name, unit, factor, decimals)
-    return [measured, measured._replace(column=f"{column}_predicted", name="predicted")]
+    return [measured, measured.called("predicted", f"{measured.column}_predicted")]
 
 
 def _named(group: Group) -> dict[str, object]:
@@ -178,7 +177,7 @@ def _goals(validation: Validation) -> Table:
     columns: Columns = [
         Text("goal", "goal"),
         Text("word", "in the worst group", "word"),
-        *(Measure(word, word, decimals=0) for word in ORDER if word),
+        *(Measure(word, word) for word in ORDER if word),
     ]
     return Table("goals", "Does the simulator predict this cell?", columns, rows)
 
@@ -214,11 +213,11 @@ def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
     columns: Columns = [
         Measure("minutes", "min"),
         Text("enough", "enough"),
-        Measure("excluded", "windows excluded", decimals=0),
-        *_pair("l95", "L95 measured", "ms"),
+        Measure("excluded", "windows excluded"),
+        *_pair(METRICS["l95_ms"].called("L95 measured", "l95")),
         Measure("l95_off", "off", "%", 100.0, signed=True),
         Text("l95_word", "L95", "word"),
-        *_pair("rate", "V_D measured", "%", 100.0),
+        *_pair(METRICS["violation_rate"].called("V_D measured", "rate")),
         Text("rate_word", "V_D", "word"),
         Text("node", "worst node"),
         Measure("use_off", "U off", "points", 100.0, signed=True),
@@ -230,7 +229,7 @@ def _verdicts(validation: Validation, *, compact: bool = False) -> Table:
         Text("sum_word", "beaten", "word"),
     ]
     if compact:
-        columns = [one for one in columns if one[0] in SHORT]
+        columns = [one for one in columns if one.column in SHORT]
     caption = (
         "L95 of all cycles together, ∞ if more than 5 % are lost. Placed: the dominant "
         "placement. ATP is our reconstruction."
@@ -257,7 +256,8 @@ def _over(validation: Validation) -> Figure:
     """Draw predicted over measured L95, V_D and U, with the allowed error as a band."""
     import polars as pl
 
-    titles = {"l95_ms": "L95 (ms)", "violation_rate": "V_D (%)", "use": "U of every node (%)"}
+    shown = (METRICS["l95_ms"], METRICS["violation_rate"], Measure("use", "U of every node", "%"))
+    titles = {measure.column: measure.heading for measure in shown}
     goal = pl.col("metric").str.replace("^u_.*", "use")
     factor = pl.when(goal == "l95_ms").then(1.0).otherwise(100.0)
     numbers = {"low": "measured_low", "high": "measured_high", "predicted": "predicted"}
@@ -323,7 +323,7 @@ def _scatter(
         "layer": marks,
     }
     shade = {"data": {"values": band}, **layer("area", allowed, color=SHADE, clip=True)}
-    return square(size, across, up, limit, shade, groups)
+    return square(size, across, up, [limit, limit], shade, groups)
 
 
 def _panel(group: Group) -> str:
@@ -386,10 +386,10 @@ def _rates(validation: Validation) -> Table:
             }
         )
     columns: Columns = [
-        *_pair("near", "within 10 % of D, measured", "%", 100.0),
-        *_pair("rate", "V_D measured", "%", 100.0),
-        Measure("shorter", "if 10 % shorter", "%", 100.0),
-        Measure("longer", "if 10 % longer", "%", 100.0),
+        *_pair(Measure("near", "within 10 % of D, measured", "%", 100.0)),
+        *_pair(METRICS["violation_rate"].called("V_D measured", "rate")),
+        METRICS["violation_rate"].called("if 10 % shorter", "shorter"),
+        METRICS["violation_rate"].called("if 10 % longer", "longer"),
         Measure("factor", "factor", decimals=2),
     ]
     caption = (
@@ -411,7 +411,7 @@ def _parts(validation: Validation) -> Table:
         column
         for part, shown in PARTS_SHOWN.items()
         for column in (
-            *_pair(part, f"{shown}, measured", "ms", decimals=2),
+            *_pair(Measure(part, f"{shown}, measured", "ms", decimals=2)),
             Measure(f"{part}_off", "off", "ms", decimals=2, signed=True),
         )
     ]
@@ -422,7 +422,7 @@ def _jobs(validation: Validation) -> Table:
     columns: Columns = [
         Text("task", "task"),
         Text("node", "node"),
-        Measure("jobs", "jobs", decimals=0),
+        Measure("jobs", "jobs"),
         Measure("measured_ms", "measured", "ms", decimals=2),
         Measure("measured_p95_ms", "P95", "ms", decimals=2),
         Measure("predicted_ms", "predicted", "ms", decimals=2),
@@ -457,9 +457,10 @@ def _compared(validation: Validation, slug: str, names: Sequence[str], title: st
                 row |= interval_row({name: group.figures[name].measured})
                 row[f"{name}_predicted"] = group.figures[name].predicted.value
         rows.append(row)
-    called = {"window_l95_ms": ("L95 of windows", "ms"), "migrations": ("migrations", "")}
+    l95 = METRICS["l95_ms"].called("L95 of windows", "window_l95_ms")
+    known = {l95.column: l95, **METRICS}
     columns: list[Measure] = []
     for name in names:
-        shown, unit = called.get(name, (name.partition("_")[2], "%"))
-        columns += _pair(name, shown, unit, 100.0 if unit == "%" else 1.0)
+        used = Measure(name, name.partition("_")[2], "%", 100.0)
+        columns += _pair(known.get(name, used))
     return _table(validation, slug, title, columns, rows)

@@ -78,10 +78,7 @@ def calibrate(
     """
     from dwell.cellfile import load
 
-    if out.suffix not in (".yaml", ".yml"):
-        raise RunError(f"{out}: a cell file ends in .yaml")
-    if out.exists() and out.samefile(cell):
-        raise RunError(f"{out} is the cell itself; name another file")
+    _require_new(out, cell)
     problem = load(cell)
     measured = _measured(runs, problem)
     messaging_ms = messaging(measured, problem)
@@ -118,29 +115,49 @@ def calibrate(
         **stamp(),
         "emulated_links": emulated,
         "tasks": {task_name(*site): _about(of) for site, of in costs.items()},
-        "links": {
-            link: _short({"added_ms": added_ms.get(link), "mean_ms": values.mean()})
-            for link, values in delays_ms.items()
-        },
+        "links": _link_delays(added_ms, delays_ms),
         **nodes,
         "work_ms": _short(usual.work_ms),
         "sensitivity": _short(
             {task_name(*site): value for site, value in usual.sensitivity.items()}
         ),
         "check": [row for one in measured if (row := _check(one, written, usual)) is not None],
-        "missing": [
-            *(
-                task_name(task.name, node)
-                for task in problem.pipeline.tasks.values()
-                for node in task.on
-                if (task.name, node) not in costs
-            ),
-            *(link for link in problem.fabric.links if link not in delays_ms),
-        ],
+        "missing": _missing(problem, costs, delays_ms),
     }
     write_whole(out.with_name(f"{out.stem}.calibration.json"), json.dumps(report, indent=2) + "\n")
     for line in _lines(report):
         say(line)
+
+
+def _require_new(out: Path, cell: Path) -> None:
+    """Raise a RunError if the new cell file is the old one, or no YAML file."""
+    if out.suffix not in (".yaml", ".yml"):
+        raise RunError(f"{out}: a cell file ends in .yaml")
+    if out.exists() and out.samefile(cell):
+        raise RunError(f"{out} is the cell itself; name another file")
+
+
+def _link_delays(
+    added_ms: Mapping[str, float], delays_ms: Mapping[str, Floats]
+) -> dict[str, dict[str, float]]:
+    """Return the added and the mean delay of each link."""
+    return {
+        link: _short({"added_ms": added_ms.get(link), "mean_ms": values.mean()})
+        for link, values in delays_ms.items()
+    }
+
+
+def _missing(
+    problem: Problem, costs: Mapping[SiteName, TaskCost], delays_ms: Mapping[str, Floats]
+) -> list[str]:
+    """Return the tasks and links without enough samples."""
+    tasks = [
+        task_name(task.name, node)
+        for task in problem.pipeline.tasks.values()
+        for node in task.on
+        if (task.name, node) not in costs
+    ]
+    return tasks + [link for link in problem.fabric.links if link not in delays_ms]
 
 
 def _cpus(measured: Sequence[Measured]) -> dict[str, tuple[int, ...]]:

@@ -10,12 +10,13 @@ import os
 import shutil
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 
-from dwell.cli.findings import Finding, Part, optional
+from dwell.cli.findings import Check, Finding, Part, optional
 from dwell.errors import LiveError
 from dwell.live.local.burner import STRESS_NG
 from dwell.live.local.cgroups import find_cgroups
@@ -45,25 +46,42 @@ WINDOW_S = 2.0
 PRIVILEGED = "run it as root; in a container, start that with --privileged"
 
 
-def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[Finding]:
-    """Check everything that a testbed needs from this machine.
+def checks_for(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[Check]:
+    """Return all checks of a machine for testbeds, each with its remedy.
 
-    The quotas of all `problems` must fit together. For `watch_s` seconds the check watches for
-    standstills, as on a virtual machine with a busy host; 0 skips it. The cells can run here if
-    all needed findings are good.
+    The quotas of all `problems` must fit together. For `watch_s` seconds the last check watches for
+    standstills, as on a virtual machine with a busy host; 0 leaves it out.
     """
+    watch = partial(_standstill, problems, watch_s)
+    another = "another time of day, or a machine without other users"
     return [
-        _root(),
+        Check("root", _root, "sudo dwell testbed ..."),
         _command("ip", "iproute2"),
         _command("nsenter", "util-linux"),
-        *_tried(),
-        _pinning(),
-        _cores(problems),
+        Check("network namespaces", partial(_hosts, [ALONE], []), PRIVILEGED),
+        Check(
+            "TUN devices",
+            partial(_hosts, PAIR, [PAIR]),
+            "modprobe tun; in a container, start that with --device /dev/net/tun",
+        ),
+        Check("CPU quotas", _quotas, PRIVILEGED),
+        Check(
+            "shortest period of a quota",
+            _shortest_period,
+            "a kernel with CFS_BANDWIDTH and short periods, and rights to use it",
+        ),
+        Check("CPUs of a group", _pinning, "apt-get install util-linux"),
+        Check("CPUs", partial(_cores, problems), "smaller quotas, or a machine with more CPUs"),
         _command(STRESS_NG[0], STRESS_NG[0], "; Dwell uses its own busy loop", needed=False),
-        _pressure(),
-        _fifo(),
-        *([_standstill(problems, watch_s)] if watch_s > 0 else ()),
+        Check("pressure (PSI)", _pressure, "boot with psi=1", needed=False),
+        Check("real-time priority (SCHED_FIFO)", _fifo, PRIVILEGED, needed=False),
+        *([Check("no standstills", watch, another, needed=False)] if watch_s > 0 else ()),
     ]
+
+
+def examine(problems: Sequence[Problem] = (), *, watch_s: float = 0.0) -> list[Finding]:
+    """Run all checks. The cells can run here if all needed findings are good."""
+    return [check.finding() for check in checks_for(problems, watch_s=watch_s)]
 
 
 def checks(problem: Problem | None, keys: Path | None) -> Iterator[Part]:
@@ -74,85 +92,62 @@ def checks(problem: Problem | None, keys: Path | None) -> Iterator[Part]:
     yield Part("testbed", rows, "dwell testbed", "live", required)
 
 
-def _root() -> Finding:
-    if os.geteuid() == 0:
-        return Finding("root", True, "root")
-    return Finding("root", False, f"user {os.geteuid()}", "sudo dwell testbed ...")
+def _root() -> tuple[bool, str]:
+    return os.geteuid() == 0, f"user {os.geteuid()}" if os.geteuid() else "root"
 
 
-def _command(name: str, package: str, instead: str = "", *, needed: bool = True) -> Finding:
-    if where := shutil.which(name):
-        return Finding(name, True, where, needed=needed)
-    found = f"not installed{instead}"
-    return Finding(name, False, found, f"apt-get install {package}", needed=needed)
+def _command(name: str, package: str, instead: str = "", *, needed: bool = True) -> Check:
+    def look() -> tuple[bool, str]:
+        where = shutil.which(name)
+        return where is not None, where or f"not installed{instead}"
+
+    return Check(name, look, f"apt-get install {package}", needed)
 
 
 # ------------------------------------------------------------------------- what is tried
 
 
-def _tried() -> list[Finding]:
-    try:
-        with ExitStack() as stack:
-            name = _take_name(stack)
-            return [
-                _attempt("network namespaces", lambda: _hosts(name, [ALONE], []), PRIVILEGED),
-                _attempt(
-                    "TUN devices",
-                    lambda: _hosts(name, PAIR, [PAIR]),
-                    "modprobe tun; in a container, start that with --device /dev/net/tun",
-                ),
-                _attempt("CPU quotas", lambda: _quotas(name), PRIVILEGED),
-                _shortest_period(name),
-            ]
-    except LiveError as error:
-        return [Finding("trials", False, str(error), PRIVILEGED)]
+@contextmanager
+def _trial() -> Iterator[str]:
+    """Take a name for a trial, and release it at the end."""
+    with ExitStack() as stack:
+        for name in TRIALS[:-1]:
+            with suppress(LiveError):
+                stack.enter_context(Claim(name, PAIR))
+                break
+        else:
+            name = stack.enter_context(Claim(TRIALS[-1], PAIR)).name
+        yield name
 
 
-def _take_name(stack: ExitStack) -> str:
-    for name in TRIALS[:-1]:
-        with suppress(LiveError):
-            return stack.enter_context(Claim(name, PAIR)).name
-    return stack.enter_context(Claim(TRIALS[-1], PAIR)).name
+def _hosts(nodes: Sequence[str], pairs: Sequence[tuple[str, str]]) -> tuple[bool, str]:
+    with _trial() as name, Hosts(name, nodes, pairs):
+        return True, "made and removed"
 
 
-def _attempt(name: str, attempt: Callable[[], str], remedy: str) -> Finding:
-    try:
-        return Finding(name, True, attempt())
-    except LiveError as error:
-        return Finding(name, False, str(error), remedy)
+def _quotas() -> tuple[bool, str]:
+    cgroups, quota = find_cgroups(), Quota(SHARE, 100.0)
+    with _trial() as name, Groups(name, {ALONE: Share(quota=quota)}, cgroups=cgroups):
+        return True, str(cgroups)
 
 
-def _hosts(name: str, nodes: Sequence[str], pairs: Sequence[tuple[str, str]]) -> str:
-    with Hosts(name, nodes, pairs):
-        return "made and removed"
-
-
-def _quotas(name: str) -> str:
-    cgroups = find_cgroups()
-    with Groups(name, {ALONE: Share(quota=Quota(SHARE, 100.0))}, cgroups=cgroups):
-        return str(cgroups)
-
-
-def _shortest_period(name: str) -> Finding:
-    what = "shortest period of a quota"
+def _shortest_period() -> tuple[bool, str]:
     said = "none was accepted"
     for period_ms in PERIODS_MS:
         try:
-            used = _share_used(name, Quota(SHARE, period_ms))
+            used = _share_used(Quota(SHARE, period_ms))
         except LiveError as error:
             said = str(error)
             continue
-        if used <= ALLOWANCE * SHARE:
-            found = f"{period_ms:g} ms (a busy process with {SHARE:g} CPU got {used:.2f})"
-            remedy = "" if (ok := period_ms <= SHORT_MS) else "another kernel"
-            return Finding(what, ok, found, remedy)
         said = f"a busy process with {SHARE:g} CPU got {used:.2f}"
-    return Finding(what, False, said, "a kernel with CFS_BANDWIDTH, and rights to use it")
+        if used <= ALLOWANCE * SHARE:
+            return period_ms <= SHORT_MS, f"{period_ms:g} ms ({said})"
+    return False, said
 
 
-def _share_used(name: str, quota: Quota) -> float:
+def _share_used(quota: Quota) -> float:
     """Return the share of a CPU that a busy process gets under a quota."""
-    with Groups(name, {ALONE: Share(quota=quota)}) as groups:
+    with _trial() as name, Groups(name, {ALONE: Share(quota=quota)}) as groups:
         words = groups.inside(ALONE, ["/bin/sh", "-c", "while :; do :; done"])
         with subprocess.Popen(words, stderr=subprocess.DEVNULL) as busy:  # noqa: S603 (our own words)
             try:
@@ -167,81 +162,65 @@ def _share_used(name: str, quota: Quota) -> float:
 # ------------------------------------------------------------------------- what is looked up
 
 
-def _pinning() -> Finding:
-    name = "CPUs of a group"
+def _pinning() -> tuple[bool, str]:
     with suppress(LiveError):
         if "cpuset" in find_cgroups().folders:
-            return Finding(name, True, "by cpuset")
+            return True, "by cpuset"
     if shutil.which("taskset"):
-        return Finding(name, True, "by affinity (no controller cpuset)")
-    return Finding(name, False, "no cpuset, no taskset", "apt-get install util-linux")
+        return True, "by affinity (no controller cpuset)"
+    return False, "no cpuset, no taskset"
 
 
-def _cores(problems: Sequence[Problem]) -> Finding:
+def _cores(problems: Sequence[Problem]) -> tuple[bool, str]:
     cpus = sorted(os.sched_getaffinity(0))
     most = len(cpus) - FREE_CORES
     free = f"{most:g} for nodes, at most {1 - FREE_OF_A_CORE:g} of each"
     found = f"{len(cpus)} ({free})"
-    if most <= 0:
-        return Finding("CPUs", False, found, "a machine with more CPUs")
-    if not problems:
-        return Finding("CPUs", True, found)
-    try:
-        shares = allot(problems, cpus)
-    except LiveError as error:
-        return Finding("CPUs", False, str(error), "smaller quotas, or a machine with more CPUs")
-    told = ", ".join(
-        f"{node} on {','.join(map(str, share.cpus))}" for node, share in shares.items()
-    )
-    return Finding("CPUs", True, f"{found}: {told}")
+    if most <= 0 or not problems:
+        return most > 0, found
+    shares = allot(problems, cpus).items()
+    told = ", ".join(f"{node} on {','.join(map(str, share.cpus))}" for node, share in shares)
+    return True, f"{found}: {told}"
 
 
-def _pressure() -> Finding:
-    name = "pressure (PSI)"
+def _pressure() -> tuple[bool, str]:
+    file = Path("/proc/pressure/cpu")
     try:
-        Path("/proc/pressure/cpu").read_text()
+        file.read_text()
     except OSError as error:
-        found = f"/proc/pressure/cpu: {error.strerror}"
-        return Finding(name, False, found, "boot with psi=1", needed=False)
-    return Finding(name, True, "/proc/pressure/cpu", needed=False)
+        return False, f"{file}: {error.strerror}"
+    return True, str(file)
 
 
-def _fifo() -> Finding:
-    name = "real-time priority (SCHED_FIFO)"
+def _fifo() -> tuple[bool, str]:
     try:
         with ThreadPoolExecutor(1) as thread:  # the priority is that thread's, which ends at once
             thread.submit(os.sched_setscheduler, 0, os.SCHED_FIFO, os.sched_param(1)).result()
     except OSError as error:
-        found = f"refused ({error.strerror}); links may be late while CPUs are busy"
-        return Finding(name, False, found, PRIVILEGED, needed=False)
-    return Finding(name, True, "granted", needed=False)
+        return False, f"refused ({error.strerror}); links may be late while CPUs are busy"
+    return True, "granted"
 
 
 # ------------------------------------------------------------------------- what takes a while
 
 
-def _standstill(problems: Sequence[Problem], watch_s: float) -> Finding:
+def _standstill(problems: Sequence[Problem], watch_s: float) -> tuple[bool, str]:
     """Watch idle CPUs for standstills, which would also stop a testbed run."""
-    name, rule = "no standstills", Rule()
+    rule = Rule()
     window_s = min((one.window_ms / 1e3 for one in problems), default=WINDOW_S)
-    try:
-        late_ms = _lateness(watch_s)
-    except LiveError as error:
-        return Finding(name, False, str(error), needed=False)
+    late_ms = _lateness(watch_s)
     stalls = {at_s: ms for at_s, ms in late_ms.items() if ms > rule.stall_ms}
     windows = math.ceil(watch_s / window_s)
     # The last reading may be a little late.
     share = len({min(int(at_s / window_s), windows - 1) for at_s in stalls}) / windows
     watched = f"in {watch_s:g} s the longest was {max(late_ms.values(), default=0.0):.1f} ms"
     if not stalls:
-        return Finding(name, True, watched, needed=False)
+        return True, watched
     found = (
         f"{watched}; {share:.0%} of the windows of {window_s:.3g} s had one longer than "
         f"{rule.stall_ms:g} ms; a run fails above {rule.excluded_most:.0%}"
     )
-    remedy = "another time of day, or a machine without other users"
-    ok = share <= rule.excluded_most
-    return Finding(name, ok, found, "" if ok else remedy, needed=False)
+    return share <= rule.excluded_most, found
 
 
 def _lateness(watch_s: float) -> dict[float, float]:

@@ -18,6 +18,7 @@ from dwell_lab.testbed.speeds import work_ms
 if TYPE_CHECKING:
     import polars as pl
 
+    from dwell.model import Execution
     from dwell.record import Run
 
 SiteName: TypeAlias = tuple[str, str]
@@ -144,6 +145,17 @@ class Measured:
     delays_ms: dict[tuple[str, str, str, str], Floats] = field(default_factory=dict)
 
 
+def _visit(jobs: pl.DataFrame, execution: Execution) -> Visit:
+    """Return the jobs of a task on one node."""
+    cycles, windows = jobs["cycle"].to_numpy(), jobs["window"].to_numpy().astype(np.int64)
+    if execution.accelerator is not None:
+        stage_ms = jobs["took"].to_numpy() / 1e6
+        return Visit(np.asarray(stage_ms, np.float64), np.zeros(jobs.height), cycles, windows)
+    stage_ms = jobs["cpu_ns"].to_numpy() / 1e6 / execution.threads
+    beside_ms = _beside_ms(jobs) / execution.threads
+    return Visit(np.asarray(stage_ms, np.float64), beside_ms, cycles, windows)
+
+
 def look_at(name: str, run: Run, problem: Problem) -> Measured:
     """Return the measurements of a run with recorded jobs.
 
@@ -176,19 +188,10 @@ def look_at(name: str, run: Run, problem: Problem) -> Measured:
     visits, starts, spent_ms = {}, {}, {}
     for (task, node, shadow), of in jobs.group_by("task", "node", "shadow", maintain_order=True):
         key = str(task), str(node), bool(shadow)
-        cpu_ms = of["cpu_ns"].to_numpy() / 1e6
         starts[key] = of.height / jobs_s
-        spent_ms[key] = float(cpu_ms.mean())
+        spent_ms[key] = float((of["cpu_ns"].to_numpy() / 1e6).mean())
         if not shadow:
-            execution = problem.pipeline.tasks[key[0]].on[key[1]]
-            on_cpu = execution.accelerator is None
-            stage_ms = cpu_ms / execution.threads if on_cpu else of["took"].to_numpy() / 1e6
-            visits[key[:2]] = Visit(
-                np.asarray(stage_ms, np.float64),
-                _beside_ms(of) / execution.threads if on_cpu else np.zeros(of.height),
-                of["cycle"].to_numpy(),
-                of["window"].to_numpy().astype(np.int64),
-            )
+            visits[key[:2]] = _visit(of, problem.pipeline.tasks[key[0]].on[key[1]])
     own = jobs.filter(~pl.col("shadow"))
     handovers_ms = _taken_ms(own, "handover_ns")
     sources = {

@@ -24,10 +24,11 @@ from typing import Any
 from dwell.errors import LiveError
 from dwell.estimators.registry import resolved
 from dwell.live.host.hosting import clock_of
+from dwell.live.host.node_processes import end_all
 from dwell.live.host.operator_client import OperatorClient
 from dwell.live.local.conditions import Conditions
 from dwell.live.local.playing import Played, make_folder, play_on, require_run, undisturbed
-from dwell.live.local.processes import Processes, end_all
+from dwell.live.local.processes import Processes
 from dwell.live.local.testbed import MARK, STARTING, Testbed
 from dwell.live.local.timeline import NodeState, timeline_of, usual_conditions
 from dwell.model import Host, Link, LinkDisturbance, Normal, Problem

@@ -23,7 +23,7 @@ from dwell.live.local.testbed import MARK, STARTING
 from dwell.live.local.timeline import timeline_of
 from dwell.model import Problem
 from dwell.policies.registry import by_name, estimator_of
-from dwell.record import Run, open_run
+from dwell.record import Run, moves, open_run
 from dwell_lab.testbed.doctor import examine
 from dwell_lab.testbed.netns_testbed import NetnsTestbed
 from dwell_lab.testbed.pressure import Rule, Span, judged
@@ -217,5 +217,5 @@ def summary(run: Run) -> dict[str, Any]:
             for name, one in run.problem.fabric.resources.items()
             if not one.kind or means.get(f"u_{name}") is not None
         },
-        "migrations": int(run.decisions["migrated"].sum()),
+        "migrations": sum(not move.by_guard for move in moves(run)),
     }

@@ -237,7 +237,7 @@ class GroupJudge:
                 verdict = "explained" if l95 == "met" else "open"
                 note = (
                     "latencies 10 % shorter or longer, as L95 may be off, give "
-                    f"{100 * low:.1f} to {100 * high:.1f} %"
+                    f"{100 * low:.2f} to {100 * high:.2f} %"
                 )
         elif verdict == "missed" and measured.low <= high and low <= measured.high:
             verdict = verdict if l95 == "missed" else "open"

@@ -98,12 +98,8 @@ def read_measured(folder: Path) -> MeasuredCampaign:
     """
     import polars as pl
 
-    kept = read_campaign(folder)
-    if not kept.done:
-        raise RunError(f"{folder}: none of its {len(kept.description['plan'])} runs is done yet")
+    kept, problem = _begun(folder)
     described = kept.description
-    cell = described["cell"]
-    problem = from_document(cell, folder=folder, source=str(folder), is_record=True)
     rows: list[Row] = []
     costs: list[Row] = []
     logged: list[dict[str, Any]] = []
@@ -115,8 +111,9 @@ def read_measured(folder: Path) -> MeasuredCampaign:
         scenario, policy = str(record["scenario"]), str(record["policy"])
         counted = without_excluded(run, problem)
         repetition = int(record["repetition"])
-        labels: dict[str, str | int] = {"scenario": scenario, "policy": policy, "seed": repetition}
-        summary = summarise(counted, problem, labels)
+        summary = summarise(
+            counted, problem, {"scenario": scenario, "policy": policy, "seed": repetition}
+        )
         rows.append(summary.row)
         costs += summary.costs
         within[scenario, policy] = within.get((scenario, policy), 0) + summary.within
@@ -157,6 +154,16 @@ def read_measured(folder: Path) -> MeasuredCampaign:
         delays=delays,
         windows=pl.concat(windows),
     )
+
+
+def _begun(folder: Path) -> tuple[CampaignFolder, Problem]:
+    """Read a campaign and its cell; raise a RunError if none of its runs is done."""
+    kept = read_campaign(folder)
+    described = kept.description
+    if not kept.done:
+        raise RunError(f"{folder}: none of its {len(described['plan'])} runs is done yet")
+    source = str(folder)
+    return kept, from_document(described["cell"], folder=folder, source=source, is_record=True)
 
 
 def without_excluded(run: Run, problem: Problem) -> Run:

@@ -3,13 +3,61 @@
 import { colour, count, draw, make, number, percent, say } from "./dom.js";
 
 export const DASHES = [[], [7, 3], [2, 2], [7, 2, 2, 2], [11, 3, 3, 3], [4, 4], [9, 2, 2, 2, 2, 2]];
-/** Bins in which a miss is a cross; in more of them, a line. */
+/** Largest number of bins whose misses are crosses; misses of more bins are lines. */
 const CROSSES = 120;
-const LEFT = 50;
 const LANE = 16;
+/** Space right of the strips, for half of the last number on their axis. */
+export const RIGHT = 24;
+const LETTER = 6.4;
 
-/** Set up one strip; all of them have one x, one cursor, and one way to zoom: by dragging. */
-const strip = (root, page, height, { series, scales, axes, drawn, padding }) => {
+/** Space left of the strips and of the jobs, for the longest name of a row. */
+export const leftOf = (cells, width) => {
+  const names = cells.flatMap(({ candidates, tasks = [], has_jobs }) => [
+    ...(candidates ?? []).map(({ name }) => name),
+    ...(has_jobs ? tasks.flatMap(({ name, on }) => on.map((node) => `${name}@${node}`)) : []),
+  ]);
+  const longest = Math.max(...names.map(wide), 6);
+  return Math.round(Math.min(Math.max(LETTER * longest + 12, 50), 170, 0.26 * width));
+};
+
+/** Width of a text in letters; the letters of Chinese, Japanese and Korean are twice as wide. */
+export const wide = (text) => [...text].reduce((sum, letter) => sum + (letter.codePointAt(0) > 0x2e7f ? 1.9 : 1), 0);
+
+/** Shorten a text to a width in pixels. */
+export const fitted = (text, width) => {
+  let room = width / LETTER;
+  if (wide(text) <= room) return text;
+  room -= 1;
+  let cut = "";
+  for (const letter of text) {
+    room -= wide(letter);
+    if (room < 0) break;
+    cut += letter;
+  }
+  return `${cut}…`;
+};
+
+/** Shade the times with a disturbance, except if the whole run is disturbed: a text states this. */
+const bands = (u, cell) => {
+  if (throughout(cell)) return;
+  const { left, top, width, height } = u.bbox;
+  u.ctx.save();
+  u.ctx.fillStyle = colour("--band");
+  for (const [begin, end] of cell.disturbed ?? []) {
+    const from = Math.max(u.valToPos(begin, "x", true), left);
+    const to = Math.min(u.valToPos(end, "x", true), left + width);
+    if (to > from) u.ctx.fillRect(from, top, Math.max(to - from, 1), height);
+  }
+  u.ctx.restore();
+};
+
+export const throughout = ({ disturbed = [], begin, end, period_ms, unit }) => {
+  const slack = unit === "cycle" ? 2 : period_ms / 500;
+  return disturbed.length === 1 && disturbed[0][0] <= begin && disturbed[0][1] >= end - slack;
+};
+
+/** Set up one strip; all strips share the x scale and the cursor, and zoom by dragging. */
+const strip = (root, page, cell, height, { series, scales, axes, drawn, padding }) => {
   const select = (u) => {
     const { left, width } = u.select;
     if (width < 4) return;
@@ -20,13 +68,13 @@ const strip = (root, page, height, { series, scales, axes, drawn, padding }) => 
   const options = {
     width: Math.max(root.clientWidth, 200),
     height,
-    padding: padding ?? [8, 6, 0, 0],
+    padding: padding ?? [8, RIGHT, 0, 0],
     legend: { show: false },
     cursor: { sync: { key: "page" }, y: false, drag: { x: true, y: false, setScale: false }, points: { show: false } },
     scales: { x: { time: false, range: () => page.view }, ...scales },
     series: [{}, ...series],
     axes,
-    hooks: { setSelect: [select], draw: [(u) => drawn?.(u), (u) => playhead(u, page)] },
+    hooks: { setSelect: [select], drawClear: [(u) => bands(u, cell)], draw: [(u) => drawn?.(u), (u) => playhead(u, page)] },
   };
   const plot = new uPlot(options, [[], ...series.map(() => [])], root);
   plot.over.addEventListener("click", (event) => {
@@ -70,9 +118,9 @@ const axis = (more) => ({
 const across = (page, shown) =>
   axis({ size: shown ? 24 : 4, grid: { show: false }, values: shown ? page.ticks : () => [] });
 
-const upright = (more = {}) => axis({ size: LEFT, ...more });
+const upright = (page, more = {}) => axis({ size: (u) => leftOf(page.described, u.width), ...more });
 
-/** Latency: a bar from the least to the largest of each bin; above it a mark for every bin with a miss. */
+/** Latency: a bar from the smallest to the largest value of each bin, and a mark above each bin with a miss. */
 const latency = (root, page, cell) => {
   let data = null;
   let top = 1;
@@ -93,7 +141,7 @@ const latency = (root, page, cell) => {
       if (counts[i] === 1 || high[i] - low[i] < top / 200) {
         ctx.fillRect(x(place) - dot / 2, y(high[i]) - dot / 2, dot, dot);
       } else line(ctx, x(place), y(low[i]), x(place), y(high[i]));
-      // What is above the scale has an arrow.
+      // An arrow marks values above the scale.
       if (high[i] > top) triangle(ctx, x(place), bbox.top + 4 * ratio, 3.5 * ratio);
     });
     ctx.globalAlpha = 1;
@@ -119,20 +167,19 @@ const latency = (root, page, cell) => {
     ctx.fillText("misses", bbox.left - 5 * ratio, middle + 4 * ratio);
     ctx.restore();
   };
-  const plot = strip(root.querySelector(".plot"), page, 190, {
+  const plot = strip(root.querySelector(".plot"), page, cell, 190, {
     series: [{ paths: () => null, points: { show: false } }],
-    scales: { y: { range: () => [0, top] } },
-    axes: [across(page, false), upright()],
+    scales: { y: { range: () => [0, (top = page.top(cell))] } },
+    axes: [across(page, false), upright(page)],
     drawn,
-    padding: [LANE + 10, 6, 0, 0],
+    padding: [LANE + 10, RIGHT, 0, 0],
   });
   return (view) => {
     data = view;
-    const highest = Math.max(...view.bins.high.filter((value) => value !== null), 0);
-    top = Math.min(Math.max(highest * 1.06, cell.deadline_ms * 1.25), cell.deadline_ms * 3);
     plot.setData([view.bins.at, view.bins.high]);
     const share = view.cycles ? ` (${percent(view.missed / view.cycles, 2)})` : "";
-    say(root.querySelector(".said"), `${count(view.missed)} of ${count(view.cycles)} cycles missed in view${share}; dashed: the deadline, ${number(cell.deadline_ms, 1)} ms`);
+    const shaded = cell.disturbed?.length ? (throughout(cell) ? "; disturbed throughout" : "; shaded: disturbed") : "";
+    say(root.querySelector(".said"), `${count(view.missed)} of ${count(view.cycles)} cycles missed in view${share}; dashed: the deadline, ${number(cell.deadline_ms, 1)} ms${shaded}`);
     plot.root.setAttribute("role", "img");
     plot.root.setAttribute("aria-label", `Latency: ${root.querySelector(".said").textContent}`);
     return plot;
@@ -147,7 +194,7 @@ const triangle = (ctx, x, y, size) => {
   ctx.fill();
 };
 
-/** Placement: a lane a candidate, so that a colour need not be told from another. */
+/** Placement: each candidate has its own lane, which identifies it without its colour. */
 const ribbon = (root, page, cell) => {
   let data = null;
   const names = cell.candidates.map(({ name }) => name);
@@ -175,19 +222,19 @@ const ribbon = (root, page, cell) => {
     ctx.font = `${11.5 * devicePixelRatio}px system-ui, sans-serif`;
     ctx.textAlign = "right";
     ctx.textBaseline = "middle";
+    const room = bbox.left / devicePixelRatio - 8;
     names.forEach((name, i) => {
-      const short = name.length > 7 ? `${name.slice(0, 6)}…` : name;
-      ctx.fillText(short, bbox.left - 6 * devicePixelRatio, bbox.top + (i + 0.5) * lane);
+      ctx.fillText(fitted(name, room), bbox.left - 6 * devicePixelRatio, bbox.top + (i + 0.5) * lane);
     });
     ctx.restore();
   };
   const height = 12 + Math.max(names.length * 17, 34);
-  const plot = strip(root.querySelector(".plot"), page, height, {
+  const plot = strip(root.querySelector(".plot"), page, cell, height, {
     series: [{ paths: () => null, points: { show: false } }],
     scales: { y: { range: () => [0, 1] } },
-    axes: [across(page, false), upright({ values: () => [], grid: { show: false } })],
+    axes: [across(page, false), upright(page, { values: () => [], grid: { show: false } })],
     drawn,
-    padding: [4, 6, 0, 0],
+    padding: [4, RIGHT, 0, 0],
   });
   return (view) => {
     data = view;
@@ -203,8 +250,8 @@ const ribbon = (root, page, cell) => {
   };
 };
 
-/** Lines of a value a window; a legend names them, by dashes too, with the values at the place. */
-export const lines = (root, page, height, named, { scale, written, last }) => {
+/** Lines with one value per window; the legend has their names, dashes and current values. */
+export const lines = (root, page, cell, height, named, { scale, written, last }) => {
   const series = named.map(({ hue, dash, width }) => ({
     stroke: () => (hue.startsWith("--") ? colour(hue) : hue),
     dash,
@@ -212,10 +259,10 @@ export const lines = (root, page, height, named, { scale, written, last }) => {
     spanGaps: false,
     points: { show: (u, _, from, to) => to - from < 60, size: 4 },
   }));
-  const plot = strip(root.querySelector(".plot"), page, height, {
+  const plot = strip(root.querySelector(".plot"), page, cell, height, {
     series,
     scales: { y: scale },
-    axes: [across(page, last), upright({ values: (_, splits) => splits.map(written) })],
+    axes: [across(page, last), upright(page, { values: (_, splits) => splits.map(written) })],
   });
   const values = named.map(({ label, hue, dash, width }) => {
     const value = make("b");
@@ -241,16 +288,18 @@ export const charts = (root, page, cell) => {
   const costs = lines(
     part("costs"),
     page,
+    cell,
     130,
     [
       ...cell.candidates.map(({ name, hue }, i) => ({ key: `j ${name}`, label: name, hue, dash: DASHES[i % DASHES.length] })),
       { key: "cost", label: "seen", hue: "--ink", dash: [], width: 2.4 },
     ],
-    { scale: { range: (_, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.1, false)) }, written: (value) => number(value, 2) },
+    { scale: { range: () => page.costs() }, written: (value) => number(value, 2) },
   );
   const used = lines(
     part("used"),
     page,
+    cell,
     120,
     cell.resources.map(({ name, kind }, i) => ({
       key: `u ${name}`,
@@ -258,16 +307,16 @@ export const charts = (root, page, cell) => {
       hue: i % 2 ? "--muted" : "--ink",
       dash: DASHES[i % DASHES.length],
     })),
-    { scale: { range: (_, low, high) => [0, Math.max(1, high ?? 1)] }, written: (value) => `${Math.round(100 * value)}`, last: true },
+    { scale: { range: () => [0, page.most("used", 1)] }, written: (value) => `${Math.round(100 * value)}`, last: true },
   );
   const setters = [latency(part("latency"), page, cell), ribbon(part("ribbon"), page, cell), costs.set, used.set];
   let plots = [];
   return {
-    /** Draw what is between two places. */
+    /** Draw the data between two places. */
     set: (view) => {
       plots = setters.map((set) => set(view));
     },
-    /** Say the values of one state in the legends. */
+    /** Write the values of a state into the legends. */
     read: (state) => {
       costs.read((key) =>
         key === "cost" ? number(state.window?.seen.cost, 2) : number(state.candidates?.[key.slice(2)]?.cost, 2),
@@ -275,5 +324,60 @@ export const charts = (root, page, cell) => {
       used.read((key) => percent(state.used?.[key.slice(2)]));
     },
     redraw: () => plots.forEach((plot) => plot.redraw(false)),
+    /** Ends of the y scales. */
+    scales: () => plots.map(({ scales: { y } }) => [y.min, y.max]),
+    /** Redraw on the scales that all cells of the page share. */
+    rescale: () => plots.forEach((plot) => plot.redraw()),
+  };
+};
+
+/** Extremes of a view, for scales that all cells of the page share. */
+export const extremes = ({ bins, windows }) => {
+  const values = (test) => Object.entries(windows.of).flatMap(([key, column]) => (test(key) ? column.filter((value) => value !== null) : []));
+  const costs = values((key) => key === "cost" || key.startsWith("j "));
+  return {
+    latency: Math.max(...bins.high.filter((value) => value !== null), 0),
+    costs: costs.length ? [Math.min(...costs), Math.max(...costs)] : null,
+    used: Math.max(...values((key) => key.startsWith("u ")), 0),
+  };
+};
+
+/** V_D of the second run minus V_D of the first: bars from 0, upwards if the second misses more. */
+export const difference = (root, page, cell) => {
+  let data = null;
+  const drawn = (u) => {
+    if (data === null) return;
+    const { ctx, bbox } = u;
+    const { begin, end, points } = data;
+    ctx.save();
+    begin.forEach((from, i) => {
+      if (points[i] === null) return;
+      const left = Math.max(u.valToPos(from, "x", true), bbox.left);
+      const right = Math.min(u.valToPos(end[i], "x", true), bbox.left + bbox.width);
+      const [zero, y] = [u.valToPos(0, "y", true), u.valToPos(points[i], "y", true)];
+      ctx.fillStyle = colour(points[i] > 0 ? "--bad" : "--good");
+      if (right > left) ctx.fillRect(left, Math.min(zero, y), Math.max(right - left - 1, 1), Math.max(Math.abs(y - zero), 1));
+    });
+    ctx.restore();
+  };
+  const range = () => {
+    const most = Math.max(...(data?.points ?? []).map((value) => Math.abs(value ?? 0)), 1);
+    return [-1.1 * most, 1.1 * most];
+  };
+  const plot = strip(root.querySelector(".plot"), page, cell, 120, {
+    series: [{ paths: () => null, points: { show: false } }],
+    scales: { y: { range } },
+    axes: [across(page, true), upright(page)],
+    drawn,
+  });
+  return {
+    set: (view, words) => {
+      data = view;
+      plot.setData([view.begin, view.points]);
+      say(root.querySelector(".said"), words);
+      plot.root.setAttribute("role", "img");
+      plot.root.setAttribute("aria-label", `Difference: ${words}`);
+    },
+    redraw: () => plot.redraw(false),
   };
 };

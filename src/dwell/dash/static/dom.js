@@ -1,11 +1,17 @@
-// Elements and numbers. A text is only ever text: nothing here, or anywhere, parses markup.
+// Elements and numbers. Texts are set as text: the page never parses them as markup.
 
 const SVG = "http://www.w3.org/2000/svg";
+
+/** Write a text; HTML elements show the D of V_D as a subscript. */
+const write = (element, text) => {
+  const [first, ...parts] = element.namespaceURI === SVG ? [text] : String(text).split("V_D");
+  element.replaceChildren(first, ...parts.flatMap((part) => ["V", make("sub", { text: "D" }), part]));
+};
 
 const put = (element, attributes, children) => {
   for (const [name, value] of Object.entries(attributes)) {
     if (value === null || value === undefined || value === false) continue;
-    if (name === "text") element.textContent = value;
+    if (name === "text") write(element, value);
     else if (name === "hue") element.style.setProperty("--hue", value);
     else if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
     else element.setAttribute(name, value === true ? "" : value);
@@ -20,9 +26,14 @@ export const make = (tag, attributes = {}, ...children) =>
 export const draw = (tag, attributes = {}, ...children) =>
   put(document.createElementNS(SVG, tag), attributes, children);
 
-/** Say something where it is not said already, so that screen readers are told of news alone. */
+/** Last text of each element. */
+const said = new WeakMap();
+
+/** Set the text of an element if it changes; screen readers announce every change. */
 export const say = (element, text) => {
-  if (element.textContent !== text) element.textContent = text;
+  if (said.get(element) === text) return;
+  said.set(element, text);
+  write(element, text);
 };
 
 export const number = (value, digits = 1) =>
@@ -39,7 +50,7 @@ export const ago = (ms) => {
   return ms < 120000 ? `${Math.round(ms / 1000)} s` : `${Math.round(ms / 60000)} min`;
 };
 
-/** A place on the time line, as people read it. */
+/** Text of a place on the time line. */
 export const place = (at, unit) => {
   if (unit === "cycle") return `cycle ${count(Math.floor(at))}`;
   return `${at.toLocaleString("en", { minimumFractionDigits: 1, maximumFractionDigits: 1 })} s`;

@@ -1,20 +1,20 @@
-// The cells of a fleet as small multiples, worst first, and what they have in common.
+// The cells of a fleet as small multiples, worst first, and the charts of the fleet.
 
-import { DASHES, lines } from "./charts.js";
+import { DASHES, lines, throughout } from "./charts.js";
 import { count, draw, make, number, percent, say } from "./dom.js";
 import * as panel from "./panel.js";
 import { get, latest } from "./server.js";
 
 const BINS = 400;
-/** Heights: of the marks of lost cycles, down to the foot of the strip below, of a lane; widths are shares of a thousand. */
+/** Heights of the marks of lost cycles, of the strip with these marks, and of a lane; width of the drawing. */
 const MARKS = 7;
 const STRIP = 50;
 const LANE = 9;
 const WIDE = 1000;
-/** Names of cells that are told of one placement. */
+/** Largest number of cell names shown per placement. */
 const NAMED = 24;
 
-/** One cell: its name, which leads to its own page, how it is, and its strip over the ribbon. */
+/** One cell: its name (a link to its page), its health, and its strip above the ribbon. */
 class Small {
   constructor(cell, fleet, page) {
     this.cell = cell;
@@ -23,10 +23,12 @@ class Small {
     this.over = draw("path", { class: "over" });
     this.lost = draw("path", { class: "lost" });
     this.due = draw("path", { class: "due" });
+    this.disturbed = throughout(fleet) ? [] : fleet.disturbed;
+    this.bands = draw("path", { class: "band" });
     this.title = draw("title");
     this.height = STRIP + 4 + LANE * fleet.placements.length;
     const size = { viewBox: `0 0 ${WIDE} ${this.height}`, height: this.height, preserveAspectRatio: "none", role: "img" };
-    const svg = draw("svg", size, this.title, this.within, this.over, this.lost, this.due, ...this.lanes);
+    const svg = draw("svg", size, this.title, this.bands, this.within, this.over, this.lost, this.due, ...this.lanes);
     this.lanes.forEach((lane, i) => lane.style.setProperty("fill", fleet.placements[i].hue));
     this.deadline = make("span", { text: number(cell.deadline_ms, 0), class: "deadline" });
     const names = fleet.placements.map(({ name }) => make("span", { text: name, title: name }));
@@ -38,7 +40,7 @@ class Small {
     this.root = make(
       "li",
       { class: "small" },
-      make("h4", {}, this.link, make("span", { class: "rate", text: `V_D ${percent(cell.rate, 1)}` })),
+      make("h4", {}, this.link, make("span", { class: cell.verdict === "missed" ? "rate bad" : "rate", text: `V_D ${percent(cell.rate, 2)}${cell.verdict ? `: ${cell.verdict}` : ""}` })),
       make("p", {}, this.health),
       make("div", { class: "plot" }, make("div", { class: "lanes", "aria-hidden": "true" }, this.deadline, ...names), make("div", { class: "drawn" }, svg)),
       this.seen,
@@ -54,12 +56,13 @@ class Small {
     const [within, over, gone] = [[], [], []];
     at.forEach((from, i) => {
       if (lost[i]) gone.push(`M${x(from)} 0V${MARKS - 2}`);
-      // L95 of a window is without end where it is that of a lost cycle.
+      // L95 is infinite if it falls on a lost cycle.
       const upper = lost[i] ? MARKS : y(high[i]);
       const bar = (top, bottom) => `M${x(from)} ${top.toFixed(1)}H${x(at[i + 1] ?? end)}V${bottom.toFixed(1)}H${x(from)}z`;
       within.push(bar(Math.max(upper, due), STRIP));
       if (upper < due) over.push(bar(upper, due));
     });
+    this.bands.setAttribute("d", this.disturbed.filter(([from, to]) => to > begin && from < end).map(([from, to]) => `M${x(from)} 0H${x(to)}V${STRIP}H${x(from)}z`).join(""));
     this.within.setAttribute("d", within.join(""));
     this.over.setAttribute("d", over.join(""));
     this.lost.setAttribute("d", gone.join(""));
@@ -78,8 +81,10 @@ class Small {
 
   show(state) {
     panel.health(this.root, state, false);
+    // Health covers only the last windows: a run that missed its aim is not green.
+    this.health.classList.toggle("ok", this.cell.verdict !== "missed" && state.health === "ok");
     const { window: seen, decision } = state;
-    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 0)}` : "");
+    say(this.seen, seen ? `window ${seen.number}: L95 ${number(seen.seen.l95_ms, 1)} ms, V_D ${percent(seen.seen.violation_rate, 2)}` : "");
     say(this.last, decision ? `decided: ${panel.decided_in_words(decision)}` : `${state.placement}; no decision yet`);
   }
 }
@@ -92,7 +97,8 @@ export class FleetView {
     this.part = (name) => this.root.querySelector(`.${name}`);
     this.part("name").textContent = fleet.name;
     this.part("source").textContent = `fleet of ${count(fleet.count)}`;
-    panel.describe(this.root, fleet);
+    panel.describe(this.root, { ...fleet, worst: null });
+    this.judge(fleet);
     this.smalls = fleet.cells.map((cell) => new Small(cell, fleet, page));
     this.part("smalls").append(...this.smalls.map(({ root }) => root));
     this.charts = this.common();
@@ -100,12 +106,26 @@ export class FleetView {
     this.loadState = latest(() => this.stateAt(), (error) => page.failed(error));
   }
 
-  /** Less than three windows show nothing. */
+  /** Show how many cells kept the aim. */
+  judge({ verdicts, aim, cells, mean_rate }) {
+    const part = this.part("verdict");
+    const judged = Object.values(verdicts).reduce((sum, one) => sum + one, 0);
+    part.hidden = judged === 0;
+    if (part.hidden) return;
+    const { kept = 0, missed = 0, open = 0 } = verdicts;
+    part.classList.toggle("ok", kept === judged);
+    part.classList.toggle("bad", missed > 0);
+    const others = [missed ? `${count(missed)} missed it` : "", open ? `${count(open)} open` : ""].filter(Boolean).join(", ");
+    part.querySelector(".judged").textContent = `${missed ? "▲" : kept === judged ? "●" : "○"} ${count(kept)} of ${count(judged)} cells kept the aim of under ${number(100 * aim, 0)} % missed${others ? `: ${others}` : ""}`;
+    part.querySelector(".more").textContent = `deadlines missed after the warm-up: worst ${percent(cells[0].rate, 2)} (${cells[0].name}), mean ${percent(mean_rate, 2)}`;
+  }
+
+  /** The shortest view: three windows. */
   get least() {
     return (3 * this.cell.window_cycles * this.cell.period_ms) / 1000;
   }
 
-  /** What all cells have in common, over time. */
+  /** Charts over time of all cells together: placements, load of shared nodes, Φ. */
   common() {
     const { placements, shared, cells, has_phi } = this.cell;
     const dashed = (i) => DASHES[i % DASHES.length];
@@ -125,7 +145,7 @@ export class FleetView {
       ],
       [
         "phi",
-        has_phi ? [{ key: "phi", label: "Φ a cell", hue: "--ink", dash: [] }] : [],
+        has_phi ? [{ key: "phi", label: "Φ per cell", hue: "--ink", dash: [] }] : [],
         { scale: { range: (_, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.1, false)) }, written: (value) => number(value, 1) },
         (state) => (state.round === null ? "–" : `${number(state.phi, 3)}, round ${count(state.round)}`),
       ],
@@ -134,7 +154,7 @@ export class FleetView {
       const root = this.part(name);
       root.hidden = named.length === 0;
       if (root.hidden) return [];
-      const chart = lines(root, this.page, 120, named, { ...how, last: true });
+      const chart = lines(root, this.page, this.cell, 120, named, { ...how, last: true });
       const set = (view) => chart.set(name === "phi" ? { windows: view.rounds } : view);
       return [{ set, show: (state) => chart.read((key) => value(state, key)) }];
     });
@@ -150,7 +170,7 @@ export class FleetView {
     this.view = [begin, end];
     this.plots = this.charts.map((chart) => chart.set(view));
     this.smalls.forEach((small, i) => small.set(view.cells[i], this.view, top, this.cell.placements));
-    say(this.part("scale"), `V_D after the warm-up · strips: L95 by window, 0 to ${number(top, 0)} ms; dashed: the deadline; a tick on top: a lost cycle · lanes: where it is`);
+    say(this.part("scale"), `V_D after the warm-up · strips: L95 by window, 0 to ${number(top, 0)} ms; dashed: the deadline; a tick on top: a lost cycle${this.cell.disturbed.length && !throughout(this.cell) ? "; shaded: disturbed" : ""} · lanes: placement`);
     panel.events(this.root, this.cell, view, this.page);
     this.redraw();
   }
@@ -165,15 +185,14 @@ export class FleetView {
   }
 
   facts({ cells, phi }) {
-    const [worst] = this.cell.cells;
     const rates = cells.flatMap(({ window: seen }) => seen?.seen.violation_rate ?? []);
-    const parts = [`V_D: worst ${percent(worst.rate, 1)} (${worst.name}), mean ${percent(this.cell.mean_rate, 1)}`];
-    if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 0)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 0)}`);
-    if (phi !== null) parts.push(`Φ a cell ${number(phi, 3)}`);
+    const parts = [];
+    if (rates.length) parts.push(`in the last window: worst ${percent(Math.max(...rates), 2)}, mean ${percent(rates.reduce((a, b) => a + b) / rates.length, 2)}`);
+    if (phi !== null) parts.push(`Φ per cell ${number(phi, 3)}`);
     say(this.part("facts"), parts.join(" · "));
   }
 
-  /** Which cells are where. */
+  /** List the cells by placement. */
   who({ cells }) {
     const body = this.part("who");
     const names = this.cell.placements.map(() => []);

@@ -1,48 +1,55 @@
-// The jobs of a few cycles, each on its node.
+// The jobs of a few cycles by task and node, on the time line of the strips.
 
+import { fitted, leftOf, RIGHT } from "./charts.js";
 import { draw, number, say } from "./dom.js";
 
 const ROW = 18;
-const LEFT = 110;
 
-export const gantt = (root, cell, { jobs, cycles }) => {
+export const gantt = (root, cell, page, { jobs, cycles, origin_s }) => {
   const plot = root.querySelector(".plot");
   const rows = new Map();
   for (const { name: node } of cell.nodes)
     for (const { name: task, on } of cell.tasks)
       if (on.includes(node)) rows.set(`${task}@${node}`, rows.size);
-  const width = Math.max(plot.clientWidth, 280);
-  const left = Math.min(LEFT, width * 0.3);
-  const ends = jobs.flatMap((job) => [job.ready_ms, job.start_ms, job.end_ms].filter((at) => at !== null));
-  const last = Math.max(...ends, ...cycles.map(({ release_ms }) => release_ms + cell.deadline_ms), 1);
-  const x = (ms) => left + (ms / last) * (width - left - 8);
+  const width = Math.max(plot.clientWidth, 200);
+  const left = leftOf(page.described, width);
+  const [begin, end] = page.view;
+  // Jobs have times in ms since the first release in view; the time line counts seconds or cycles.
+  const [origin, each] = cell.unit === "cycle" ? [cycles[0]?.cycle ?? 0, cell.period_ms] : [origin_s, 1000];
+  const x = (ms) => left + ((origin + ms / each - begin) / (end - begin)) * (width - left - RIGHT);
+  const inside = (at) => at >= left - 0.5 && at <= width - RIGHT + 0.5;
+  const clipped = (at) => Math.min(Math.max(at, left), width - RIGHT);
+  const last = (end - origin) * each;
   const height = rows.size * ROW + 24;
   const svg = draw("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img" });
   const missed = cycles.filter((cycle) => cycle.missed).map(({ cycle }) => cycle);
   svg.append(draw("title", { text: `${jobs.length} jobs of ${cycles.length} cycles; missed: ${missed.join(", ") || "none"}` }));
+  const period = x(cell.period_ms) - x(0);
   for (const cycle of cycles) {
     const at = x(cycle.release_ms);
     const due = x(cycle.release_ms + cell.deadline_ms);
-    svg.append(
-      draw("line", { class: "release", x1: at, y1: 14, x2: at, y2: height - 8 }),
-      draw("line", { class: "due", x1: due, y1: 14, x2: due, y2: height - 8 }),
-    );
-    if (x(cell.period_ms) - x(0) > 34)
-      svg.append(draw("text", { x: at + 3, y: 11, text: `${cycle.cycle}${cycle.missed ? " ×" : ""}` }));
+    if (inside(at)) svg.append(draw("line", { class: "release", x1: at, y1: 14, x2: at, y2: height - 8 }));
+    if (inside(due)) svg.append(draw("line", { class: "due", x1: due, y1: 14, x2: due, y2: height - 8 }));
+    if (period > 34 && inside(at) && at + 34 < width) svg.append(draw("text", { x: at + 3, y: 11, text: `${cycle.cycle}${cycle.missed ? " ×" : ""}` }));
   }
-  for (const [name, row] of rows)
-    svg.append(draw("text", { class: "muted", x: left - 6, y: 18 + row * ROW + 12, "text-anchor": "end", text: name }));
+  for (const [name, row] of rows) {
+    const text = fitted(name, left - 8);
+    const label = draw("text", { class: "muted", x: left - 6, y: 18 + row * ROW + 12, "text-anchor": "end", text });
+    if (text !== name) label.append(draw("title", { text: name }));
+    svg.append(label);
+  }
   for (const job of jobs) {
     const y = 18 + rows.get(`${job.task}@${job.node}`) * ROW;
-    const begin = job.start_ms ?? job.end_ms ?? last;
+    const from = job.start_ms ?? job.end_ms ?? last;
     const words = `${job.task} on ${job.node}, cycle ${job.cycle}: ready ${number(job.ready_ms, 2)}, from ${number(job.start_ms, 2)} to ${number(job.end_ms, 2)} ms, ${job.outcome}${job.shadow ? ", shadow" : ""}`;
-    if (begin - job.ready_ms > 0.01)
-      svg.append(draw("line", { class: "wait", x1: x(job.ready_ms), y1: y + 8, x2: x(begin), y2: y + 8 }));
-    if (job.start_ms === null) continue;
+    if (from - job.ready_ms > 0.01)
+      svg.append(draw("line", { class: "wait", x1: clipped(x(job.ready_ms)), y1: y + 8, x2: clipped(x(from)), y2: y + 8 }));
+    if (job.start_ms === null || x(from) >= width - RIGHT) continue;
     const kind = [job.cycle % 2 ? "odd" : "", job.shadow ? "shadow" : "", job.outcome === "done" ? "" : "lost"];
-    const box = { x: x(begin), y: y + 2, width: Math.max(x(job.end_ms ?? last) - x(begin), 1), height: ROW - 6, rx: 2 };
+    const [at, until] = [clipped(x(from)), clipped(x(job.end_ms ?? last))];
+    const box = { x: at, y: y + 2, width: Math.max(until - at, 1), height: ROW - 6, rx: 2 };
     svg.append(draw("rect", { class: `job ${kind.join(" ")}`, ...box }, draw("title", { text: words })));
   }
   plot.replaceChildren(svg);
-  say(root.querySelector(".said"), `${number(last, 0)} ms from the first release; dashed: deadlines`);
+  say(root.querySelector(".said"), "by cycle; dashed: deadlines");
 };

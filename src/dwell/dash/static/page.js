@@ -1,18 +1,19 @@
-// The page: one time line, the cells on it, and how people go along it.
+// The page: one time line, its cells, and the controls to move along it.
 
-import { charts } from "./charts.js";
+import { charts, difference, extremes } from "./charts.js";
 import { count, make, place, say } from "./dom.js";
 import { FleetView } from "./fleet.js";
 import { gantt } from "./gantt.js";
 import * as panel from "./panel.js";
+import { RunsView } from "./runs.js";
 import { act, get, latest } from "./server.js";
 import { Topology } from "./topology.js";
 
-/** Seconds that a live page shows, and cycles that are few enough to show their jobs. */
+/** Seconds that a live page shows, and largest number of cycles whose jobs are shown. */
 const FOLLOWED_S = 60;
 const FEW_CYCLES = 40;
 const BINS = 700;
-/** Without news for so long, a live page does not claim to show the present. */
+/** Time without events after which a live page shows the cell as absent. */
 const STALE_MS = 3000;
 
 const element = (id) => document.getElementById(id);
@@ -38,7 +39,7 @@ class CellView {
     panel.describe(this.root, cell);
   }
 
-  /** Less than two cycles show nothing. */
+  /** The shortest view: two cycles. */
   get least() {
     return 2 * (this.page.unit === "cycle" ? 1 : this.cell.period_ms / 1000);
   }
@@ -47,12 +48,14 @@ class CellView {
     const [begin, end] = this.page.view;
     const bins = Math.min(BINS, Math.max(150, Math.round(this.root.clientWidth)));
     const view = await get("/view", { cell: this.i, begin, end, bins });
+    this.page.extremes.set(this.i, extremes(view));
     this.charts.set(view);
+    for (const other of this.page.cells) if (other !== this) other.charts.rescale();
     panel.events(this.root, this.cell, view, this.page);
     const part = this.root.querySelector(".gantt");
     const few = view.cycles > 0 && view.cycles <= FEW_CYCLES && this.cell.has_jobs;
     part.hidden = !few;
-    if (few) gantt(part, this.cell, await get("/jobs", { cell: this.i, begin, end }));
+    if (few) gantt(part, this.cell, this.page, await get("/jobs", { cell: this.i, begin, end }));
   }
 
   async stateAt() {
@@ -76,16 +79,18 @@ class CellView {
 }
 
 class Page {
-  /** Show cells, or a fleet; a cell of a fleet is asked for by its number there. */
-  constructor({ cells: alone, fleet, line, control, read_only }, numbered, at) {
+  /** Show cells or a fleet; `numbered` is the number of a cell in its fleet, or of a run in its folder. */
+  constructor({ cells: alone, fleet, runs, line, control, read_only, difference: differs }, numbered, at) {
     const cells = alone.length ? alone : [fleet];
+    this.described = cells;
+    this.extremes = new Map();
     this.control = control;
     this.readOnly = read_only;
     this.unit = cells[0].unit;
     this.live = cells.some((cell) => cell.live);
     this.span = [Math.min(...cells.map((cell) => cell.begin)), Math.max(...cells.map((cell) => cell.end))];
     this.view = this.live ? [this.span[1] - FOLLOWED_S, this.span[1]] : [...this.span];
-    this.at = this.live ? this.span[1] : (at ?? this.span[0]);
+    this.at = this.live ? this.span[1] : (at ?? cells[0].worst?.at ?? this.span[1]);
     this.playing = false;
     this.following = this.live;
     this.heardMs = performance.now();
@@ -95,7 +100,9 @@ class Page {
     element("cells").classList.toggle("two", cells.length > 1);
     this.cells = alone.length ? cells.map((cell, i) => new CellView(cell, numbered ?? i, this)) : [new FleetView(fleet, this)];
     element("cycles").hidden = !alone.length;
-    if (fleet && alone.length) this.leadBack(fleet);
+    if (fleet) this.leadBack(`${fleet.name}, the fleet`);
+    if (runs) this.leadBack(`all runs in ${runs.name}`);
+    if (differs) this.compare(cells);
     this.windowLength = (cell) => (this.unit === "cycle" ? cell.window_cycles : (cell.window_cycles * cell.period_ms) / 1000);
     this.listen();
     this.setView(...this.view);
@@ -103,14 +110,48 @@ class Page {
     this.readEvents();
   }
 
-  /** Lead from a cell's page to that of its fleet. */
-  leadBack({ name }) {
-    const link = make("a", { href: "/", text: `◀ ${name}, the fleet` });
+  /** Scales that all cells of the page share. */
+  most(name, least) {
+    return Math.max(...[...this.extremes.values()].map((one) => one[name]), least);
+  }
+
+  top() {
+    const due = Math.max(...this.described.map(({ deadline_ms }) => deadline_ms));
+    return Math.min(this.most("latency", due * 1.18) * 1.06, due * 3);
+  }
+
+  costs() {
+    const known = [...this.extremes.values()].flatMap(({ costs }) => costs ?? []);
+    return known.length ? uPlot.rangeNum(Math.min(...known), Math.max(...known), 0.1, false) : [0, 1];
+  }
+
+  /** Show the difference of missed deadlines between two runs. */
+  compare([first, second]) {
+    const root = element("difference");
+    root.hidden = false;
+    const chart = difference(root, this, first);
+    const words = `${second.source} less ${first.source}, points of per cent; above 0 the second misses more`;
+    this.difference = {
+      load: latest(
+        async () => {
+          const [begin, end] = this.view;
+          chart.set(await get("/difference", { begin, end, bins: Math.round(root.clientWidth / 6) }), words);
+        },
+        (error) => this.failed(error),
+      ),
+      redraw: chart.redraw,
+    };
+  }
+
+  /** Link a cell's page to the page of its fleet, or a run's page to the list of runs. */
+  leadBack(name) {
+    if (this.cells[0] instanceof FleetView) return;
+    const link = make("a", { href: "/", text: `◀ ${name}` });
     this.lead(link);
     element("back-to-fleet").replaceChildren(link);
   }
 
-  /** Have a link lead to the same place on another page, and the browser's way back to it here. */
+  /** Let a link keep the place on the time line, forwards and with the browser's back button. */
   lead(link) {
     link.addEventListener("click", () => {
       link.hash = String(this.at);
@@ -131,6 +172,7 @@ class Page {
     const low = this.following ? end - length : Math.min(Math.max(begin, first), last - length);
     this.view = [low, low + length];
     for (const cell of this.cells) cell.load();
+    this.difference?.load();
     this.showPlace();
   }
 
@@ -159,6 +201,7 @@ class Page {
       cell.loadState();
       cell.redraw();
     }
+    this.difference?.redraw();
     this.showPlace();
   }
 
@@ -171,12 +214,18 @@ class Page {
     } else this.moveTo(this.at + windows * length);
   }
 
-  /** Show the window that closes at a place, with one before it and one after. */
+  /** Show the window that ends at a place, with one window before it and one after. */
   toWindow(at) {
     const length = this.windowLength(this.cells[0].cell);
     this.follow(false);
     this.setView(at - 2 * length, at + length);
     this.moveTo(at);
+  }
+
+  /** Show the worst window of the first run. */
+  toWorst() {
+    const at = this.described[0].worst?.at;
+    if (!this.live && at !== undefined) this.toWindow(at);
   }
 
   toCycles() {
@@ -232,6 +281,8 @@ class Page {
     on("farther", () => this.zoomBy(2));
     on("window", () => this.toWindow(this.live ? this.view[1] : this.at));
     on("cycles", () => this.toCycles());
+    on("worst", () => this.toWorst());
+    element("worst").hidden = this.live || !this.described[0].worst;
     on("whole", () => this.zoom(...this.span));
     on("follow", () => {
       this.follow(!this.following);
@@ -254,6 +305,7 @@ class Page {
       0: () => this.zoom(...this.span),
       w: () => this.toWindow(this.live ? this.view[1] : this.at),
       c: () => this.toCycles(),
+      x: () => this.toWorst(),
     };
     document.addEventListener("keydown", (event) => {
       const busy = event.target.closest("button, input, select, a");
@@ -264,10 +316,11 @@ class Page {
     });
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
       for (const cell of this.cells) cell.redraw();
+      this.difference?.redraw();
     });
   }
 
-  // ------------------------------------------------------------------------ what is new
+  // ------------------------------------------------------------------------ events
 
   readEvents() {
     const source = new EventSource("/events");
@@ -283,9 +336,11 @@ class Page {
     }, 1000);
   }
 
-  take(cell, { state, described }) {
+  take(cell, news) {
+    const { state, described } = news;
     if (described) {
       cell.describe(described);
+      this.described[news.cell] = described;
       const atEnd = this.view[1] >= this.span[1];
       this.span[1] = Math.max(this.span[1], described.end);
       if (atEnd) this.setView(this.view[0], this.span[1]);
@@ -309,7 +364,7 @@ class Page {
     say(element("connection"), `✕ ${error.message}`);
   }
 
-  // ---------------------------------------------------------------------------- acting
+  // ---------------------------------------------------------------------------- commands
 
   async act(what, about, words) {
     if (!confirm(`${words}?`)) return;
@@ -330,20 +385,21 @@ class Page {
 
   drain(node) {
     const drained = (this.cells[0].state?.drained ?? []).includes(node);
-    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Have no stage run on ${node}`);
+    return this.act(drained ? "undrain" : "drain", { node }, drained ? `Let stages run on ${node} again` : `Keep all stages off ${node}`);
   }
 }
 
-// A page that plays for hours asks a million times; the browser need not remember when.
+// Hours of playing make a million requests; the browser need not store their times.
 performance.setResourceTimingBufferSize(0);
-/** Where the page before this one was, and the number of the cell in a fleet. */
+/** Place of the previous page on the time line, and the number of the cell in the fleet. */
 const before = location.hash.length > 1 ? Number(location.hash.slice(1)) : NaN;
 const [, numbered] = location.pathname.match(/^\/cell\/(\d+)$/) ?? [];
-// The token is in the cookie by now: it need not stay in the address, nor in the history.
+// The cookie has the token: remove it from the address and the history.
 history.replaceState(null, "", location.pathname);
 try {
   const found = await get("/cells", numbered === undefined ? {} : { cell: numbered });
-  window.page = new Page(found, numbered, Number.isFinite(before) ? before : null);
+  if (found.runs && !found.cells.length) window.page = new RunsView(found.runs);
+  else window.page = new Page(found, numbered, Number.isFinite(before) ? before : null);
 } catch (error) {
   element("connection").classList.add("bad");
   say(element("connection"), `✕ ${error.message}`);

@@ -1,16 +1,19 @@
-// What a cell's state says in words: health, candidates, the last decision, events, who is heard.
+// State of a cell in words: health, candidates, last decision, events, processes.
 
 import { ago, count, make, number, percent, place, say } from "./dom.js";
 
 const HEALTH = { ok: "●", degraded: "▲", stalled: "■", silent: "✕", absent: "✕", unmeasured: "○" };
+const windows = (length) => `${number(length, Number.isInteger(length) ? 0 : 2)} ${length === 1 ? "window" : "windows"}`;
+
 const REASONS = {
-  dwell: "the last move is too young",
-  hold: "no other candidate is better by enough",
-  migrate: "another candidate is better by enough",
-  capped: "the cheaper candidate is over a cap",
-  infeasible: "every candidate is over a cap",
-  guard: "the guard moved it by itself",
+  dwell: (_, { dwell_cycles, window_cycles }) => `the last move is too recent; at least ${windows(dwell_cycles / window_cycles)} between moves`,
+  hold: () => "no other candidate is better by enough",
+  migrate: () => "another candidate is better by enough",
+  capped: () => "the cheaper candidate is over a cap",
+  infeasible: () => "all candidates are over a cap, this one least",
+  guard: () => "the guard moved it",
 };
+const VERDICTS = { kept: "●", missed: "▲", open: "○" };
 
 export const health = (root, state, stale) => {
   const word = stale ? "absent" : (state.health ?? "absent");
@@ -20,10 +23,23 @@ export const health = (root, state, stale) => {
   say(element, `${HEALTH[word] ?? "?"} ${word}${state.headline ? `: ${state.headline}` : ""}`);
 };
 
-/** Say what does not change of a cell, or of a fleet. */
-export const describe = (root, { about, notes }) => {
-  const parts = Object.entries(about).map(([name, value]) => `${name} ${value}`);
+/** Show the constant data of a cell or of a fleet. */
+export const describe = (root, { about, notes, verdict, moves, never_moving, worst }) => {
+  const parts = Object.entries(about).map(([name, value]) => (name === "kind" ? value : `${name} ${value}`));
   root.querySelector(".where-caption").textContent = parts.join(" · ");
+  const judged = root.querySelector(".verdict");
+  judged.hidden = !verdict;
+  if (verdict) {
+    judged.classList.toggle("ok", verdict.word === "kept");
+    judged.classList.toggle("bad", verdict.word === "missed");
+    judged.querySelector(".judged").textContent = `${VERDICTS[verdict.word] ?? ""} ${verdict.text}`;
+    const more = [];
+    if (moves) more.push(moved(moves));
+    const others = Object.entries(never_moving ?? {});
+    if (others.length) more.push(`without moves: ${others.map(([name, rate]) => `${name} ${percent(rate, 2)}`).join(", ")}`);
+    if (worst) more.push(`worst window: ${count(worst.number)}, ${percent(worst.rate, 2)} missed`);
+    judged.querySelector(".more").textContent = more.join(" · ");
+  }
   root.querySelector(".notes").replaceChildren(...notes.map((text) => make("li", { text })));
 };
 
@@ -32,7 +48,12 @@ const head = (words) =>
 
 const cells = (values) => values.map((text) => make("td", { class: "num", text }));
 
-/** Build what is said of decisions once; returns what shows a state there. */
+const moved = ({ migrations, returns, guard_moves }) => {
+  const by_guard = guard_moves ? `, ${count(guard_moves)} by the guard` : "";
+  return migrations || guard_moves ? `${count(migrations)} ${migrations === 1 ? "move" : "moves"}, ${count(returns)} undone${by_guard}` : "no moves";
+};
+
+/** Build the tables of decisions once; return a function that shows a state in them. */
 export const decided = (root, cell, page) => {
   const rows = new Map();
   const body = make("tbody");
@@ -60,7 +81,7 @@ export const decided = (root, cell, page) => {
   return (state) => {
     for (const [name, { row, values, mark, button }] of rows) {
       const known = state.candidates?.[name] ?? {};
-      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 1)];
+      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 2)];
       values.forEach((value, i) => say(value, texts[i]));
       row.classList.toggle("here", name === state.placement);
       const marks = [];
@@ -71,10 +92,10 @@ export const decided = (root, cell, page) => {
       say(mark, marks.join(", "));
       button?.toggleAttribute("disabled", name === state.pinned);
     }
-    say(why, decision(state));
+    say(why, decision(state, cell));
     const { window } = state;
     say(against.querySelector("caption"), window ? `Predicted against seen: window ${window.number}, under ${window.placement}` : "Predicted against seen: no window yet");
-    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 1)];
+    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 2)];
     predicted.replaceChildren(
       ...[line("predicted", state.predicted), line("seen", window?.seen)].map(([name, ...texts]) =>
         make("tr", {}, make("th", { scope: "row", text: name }), ...cells(texts)),
@@ -87,25 +108,29 @@ export const decided = (root, cell, page) => {
   };
 };
 
-/** What was decided, in a few words. */
+/** A decision in a few words. */
 export const decided_in_words = ({ incumbent, placement, reason, refused }) => {
   const moves = placement && placement !== incumbent;
-  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${reason}${refused ? `; ✕ refused: ${refused}` : ""}`;
+  const word = reason === "infeasible" ? REASONS.infeasible() : reason;
+  return `${moves ? `${incumbent} → ${placement}` : incumbent}, ${word}${refused ? `; ✕ refused: ${refused}` : ""}`;
 };
 
-const decision = (state) => {
+const decision = (state, cell) => {
   const { decision: last, proving } = state;
   const parts = [];
   if (last) {
-    parts.push(`Last decision: ${decided_in_words({ ...last, refused: null })}: ${REASONS[last.reason] ?? "see the reasons in the documentation"}.`);
+    const { incumbent, placement, reason } = last;
+    const moves = placement && placement !== incumbent;
+    const why = REASONS[reason]?.(last, cell) ?? "see the reasons in the documentation";
+    parts.push(`Last decision: ${moves ? `${incumbent} → ${placement}` : `stayed on ${incumbent}`}: ${why} (${reason}).`);
     if (last.refused) parts.push(`✕ Refused: ${last.refused}.`);
     if (last.delta_j !== null && last.delta_j !== undefined) parts.push(`ΔJ ${number(last.delta_j, 3)}.`);
   } else parts.push("No decision yet.");
-  if (state.pinned) parts.push(`Pinned to ${state.pinned}, whatever is decided.`);
+  if (state.pinned) parts.push(`Pinned to ${state.pinned}; decisions of the policy have no effect.`);
   if (state.drained?.length) parts.push(`Drained: ${state.drained.join(", ")}.`);
-  if (state.fallback) parts.push("The guard has put it there.");
+  if (state.fallback) parts.push("The guard chose this placement.");
   if (proving) parts.push(`Proving ${proving.candidate}: ${proving.done} of ${proving.needed} probes.`);
-  if (state.mode === "advise") parts.push("Mode: advise; nothing is ordered.");
+  if (state.mode === "advise") parts.push("Mode: advise; the controller sends no orders.");
   return parts.join(" ");
 };
 
@@ -121,7 +146,7 @@ export const facts = (root, cell, state) => {
     parts.push(`answer of the controller ${ago(state.answer_age_ms)} old`);
     if (state.unproven) parts.push("clocks unproven");
     if (state.bound_ms !== null && state.bound_ms !== undefined) parts.push(`clocks within ${number(state.bound_ms, 1)} ms`);
-  } else parts.push(`${count(cell.missed)} of ${count(cell.cycles)} cycles missed in all`);
+  } else parts.push(`${count(cell.missed)} of ${count(cell.cycles)} cycles missed in all, warm-up included`);
   say(root.querySelector(".facts"), parts.join(" · "));
 };
 
@@ -133,7 +158,7 @@ export const events = (root, cell, view, page) => {
   const key = JSON.stringify([view.events, view.more_events]);
   if (list.dataset.key === String(key.length) + key.slice(-200)) return;
   list.dataset.key = String(key.length) + key.slice(-200);
-  const more = view.more_events ? `; ${count(view.more_events)} before them: come closer` : "";
+  const more = view.more_events ? `; ${count(view.more_events)} earlier: zoom in` : "";
   say(root.querySelector(".events-said"), `${count(view.events.length)} in view${more}`);
   list.replaceChildren(
     ...view.events.toReversed().map((event) =>

@@ -1,4 +1,4 @@
-// What the page asks its server: the same host it came from, and nobody else.
+// Requests of the page to its own server only.
 
 export class Refused extends Error {}
 
@@ -20,7 +20,7 @@ export const act = async (what, about) =>
     }),
   );
 
-/** Have one call of a function under way at most; of the calls meanwhile, the last follows. */
+/** Run one call of a function at a time; of the calls made during it, only the last follows. */
 export const latest = (call, failed) => {
   let busy = false;
   let next = null;

@@ -1,5 +1,6 @@
-// Computers by tier, and the stages where they run; a stage that moves slides.
+// Computers by tier with the stages that run there; a stage slides when it moves.
 
+import { fitted } from "./charts.js";
 import { draw, percent } from "./dom.js";
 
 const TIERS = ["cloud", "edge", "robot"];
@@ -8,9 +9,11 @@ const HEAD = 24;
 const FOOT = 18;
 const GAP = 14;
 const LEAST_NODE = 150;
-const BETWEEN = 46;
+const BETWEEN = 52;
+/** Largest number of node pairs whose links have a label while undisturbed. */
+const LABELLED = 12;
 
-/** Rows of nodes, the cloud on top and the robots below, as many side by side as fit. */
+/** Rows of nodes, from the cloud at the top to the robots; each row has as many nodes as fit. */
 const rowsOf = (nodes, width) => {
   const most = Math.max(1, Math.floor((width + GAP) / (LEAST_NODE + GAP)));
   return TIERS.flatMap((tier) => {
@@ -50,7 +53,8 @@ export class Topology {
     for (const row of rowsOf(nodes, wide)) {
       const width = Math.min(230, (wide - GAP * (row.length + 1)) / row.length);
       const height = HEAD + FOOT + SLOT * Math.max(1, ...row.map((node) => mayRun(node).length));
-      const left = (wide - row.length * width - (row.length - 1) * GAP) / 2;
+      // A single cloud is on the right: its links to robots then do not cross the edge.
+      const left = row.length === 1 && row[0].tier === "cloud" ? wide - width - GAP / 2 : (wide - row.length * width - (row.length - 1) * GAP) / 2;
       row.forEach((node, i) => {
         const x = row.length === 2 ? (i === 0 ? GAP / 2 : wide - width - GAP / 2) : left + i * (width + GAP);
         this.boxes.set(node.name, { x, y, width, height });
@@ -65,8 +69,14 @@ export class Topology {
     svg.append(this.title, ...this.links(links));
     this.nodes = new Map(nodes.map((node) => [node.name, this.node(node)]));
     svg.append(...[...this.nodes.values()].map((parts) => parts.group));
-    for (const [x, top, width] of this.slots.values())
-      svg.append(draw("rect", { class: "slot", x, y: top, width, height: SLOT - 6, rx: 4 }));
+    this.possible = new Map();
+    for (const [i, task] of tasks.entries())
+      for (const node of task.on) {
+        const [x, top, width] = this.slots.get(`${task.name}@${node}`);
+        const name = draw("text", { class: "possible", x: x + 8, y: top + 14.5, text: fitted(`${i + 1} ${task.name}`, width - 14) });
+        this.possible.set(`${task.name}@${node}`, name);
+        svg.append(draw("rect", { class: "slot", x, y: top, width, height: SLOT - 6, rx: 4 }), name);
+      }
     this.stages = new Map(tasks.map((task, i) => [task.name, this.stage(task, i)]));
     svg.append(...this.stages.values());
     svg.style.maxWidth = `${wide}px`;
@@ -75,6 +85,8 @@ export class Topology {
 
   links(links) {
     const seen = new Set();
+    this.pairs = new Map();
+    this.crowded = links.length > 2 * LABELLED;
     return links.flatMap(({ source, target, text }) => {
       const key = [source, target].sort().join("\n");
       if (seen.has(key)) return [];
@@ -83,19 +95,23 @@ export class Topology {
       const [x1, y1] = [a.x + a.width / 2, a.y + a.height / 2];
       const [x2, y2] = [b.x + b.width / 2, b.y + b.height / 2];
       const line = draw("line", { x1, y1, x2, y2 });
-      const words = this.narrow ? text.split(",")[0] : text;
-      // Between two rows there is room for a label; beside each other there often is none.
+      const words = this.crowded ? "" : this.narrow ? text.split(",")[0] : text;
+      // A label fits between two rows, but often not between neighbours in a row.
       const [upper, lower] = a.y < b.y ? [a, b] : [b, a];
+      let [x, y, room] = [0, y1 + 4, true];
       if (upper.y === lower.y) {
         const [left, right] = a.x < b.x ? [a, b] : [b, a];
-        if (right.x - left.x - left.width < 120) return [draw("g", { class: "link" }, line)];
-        const label = draw("text", { x: (left.x + left.width + right.x) / 2, y: y1 + 4, text: words });
-        return [draw("g", { class: "link" }, line, label)];
+        x = (left.x + left.width + right.x) / 2;
+        room = right.x - left.x - left.width >= 120;
+      } else {
+        y = (upper.y + upper.height + lower.y) / 2;
+        x = x1 + ((y + 4 - y1) / (y2 - y1)) * (x2 - x1);
       }
-      const y = (upper.y + upper.height + lower.y) / 2 + 4;
-      const share = (y - y1) / (y2 - y1);
-      const label = draw("text", { x: x1 + share * (x2 - x1), y, text: words });
-      return [draw("g", { class: "link" }, line, label)];
+      const nominal = draw("text", { x, y: y + 4, text: words });
+      const now = draw("text", { class: "now", x, y: y + 19 });
+      const group = draw("g", { class: "link" }, line, ...(room ? [nominal, now] : []));
+      this.pairs.set(key, { group, now, nominal, y });
+      return [group];
     });
   }
 
@@ -122,13 +138,13 @@ export class Topology {
     const [x, y, width] = this.slots.get(`${task.name}@${task.on[0]}`);
     const anchored = task.on.length === 1;
     const shape = draw("rect", { width, height: SLOT - 6, rx: 4 });
-    const text = draw("text", { x: 8, y: 14.5, text: `${i + 1} ${task.name}` });
+    const text = draw("text", { x: 8, y: 14.5, text: fitted(`${i + 1} ${task.name}`, width - 14) });
     const group = draw("g", { class: anchored ? "stage anchored" : "stage", "data-task": task.name }, shape, text);
     group.style.transform = `translate(${x}px, ${y}px)`;
     return group;
   }
 
-  /** Put every stage where it runs, and say how busy every computer is. */
+  /** Move each stage to its computer, and show the load of each computer. */
   show(state) {
     this.state = state;
     const candidate = this.cell.candidates.find(({ name }) => name === state.placement);
@@ -141,6 +157,7 @@ export class Topology {
       group.style.setProperty("--hue", candidate?.hue ?? "gray");
       group.dataset.node = node;
       group.firstChild.setAttribute("width", width);
+      for (const other of task.on) this.possible.get(`${task.name}@${other}`).classList.toggle("taken", other === node);
       words.push(`${task.name} on ${node}`);
     }
     const drained = new Set(state.drained ?? []);
@@ -149,7 +166,20 @@ export class Topology {
       parts.busy.setAttribute("width", parts.room * Math.min(Math.max(share ?? 0, 0), 1));
       parts.share.textContent = percent(share);
       parts.group.classList.toggle("drained", drained.has(name));
-      parts.tier.textContent = drained.has(name) ? " drained" : parts.words;
+      const met = state.disturbed?.[name];
+      parts.group.classList.toggle("disturbed", Boolean(met));
+      parts.tier.textContent = drained.has(name) ? " drained" : met ? ` ${met}` : parts.words;
+      if (met) words.push(`${name}: ${met}`);
+    }
+    for (const [key, { group, now, nominal, y }] of this.pairs) {
+      const [one, other] = key.split("\n");
+      const met = new Set([state.disturbed?.[`${one}->${other}`], state.disturbed?.[`${other}->${one}`]].filter(Boolean));
+      const text = [...met].join("; ");
+      group.classList.toggle("disturbed", met.size > 0);
+      now.textContent = this.narrow && text.includes(",") ? `${text.split(",")[0]} …` : text;
+      nominal.setAttribute("y", text ? y - 3 : y + 4);
+      now.setAttribute("y", y + 12);
+      if (text) words.push(`${one}–${other}: ${text}`);
     }
     this.title.textContent = `${state.placement ?? "unknown"}: ${words.join(", ")}`;
   }

@@ -13,8 +13,6 @@ import shlex
 import shutil
 import signal
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -26,13 +24,14 @@ import typer
 
 from dwell.errors import LiveError, ProblemError
 from dwell.live.host.kept_cell import Change, KeptCell, cell_here, change, forget
+from dwell.live.host.node_processes import NodeProcesses
 from dwell.live.host.operator_client import OperatorClient
 from dwell.live.host.process_group import ProcessGroup
 from dwell.live.host.security import Security
 from dwell.live.host.stage_modules import require_stages
-from dwell.live.host.state_files import make_folder, open_own
+from dwell.live.host.state_files import make_folder
 from dwell.live.host.state_folder import logs
-from dwell.live.host.supervision import LOG_BYTES, survivor, write_mark
+from dwell.live.host.supervision import LOG_BYTES, shorten_log, survivor, write_mark
 from dwell.live.log import printable
 from dwell.live.transport.orphans import remove_orphans
 from dwell.live.wire.local_addresses import is_here, listening_ports, taken_ports, why_not_listen
@@ -130,22 +129,19 @@ def up(
     require_stages(problem, file, nodes)
     _require_down(background, wiring, file)
     _require_ports(problem, wiring, nodes)
-    commands = {role.who: _command(role, file, folder, out, policy) for role in here}
-    with _Start(folder, out, environment) as start:
+    processes = NodeProcesses(
+        *(file.resolve(), folder),
+        root=folder.parent,
+        environment=environment,
+        start_new_session=True,
+    )
+    with _Start(processes, out) as start:
         # Check again under the lock: another `dwell live up` may have been faster.
         _require_down(background, wiring, file)
-        for who, command in commands.items():
-            start.run(who, command)
-        start.wait({who: wiring.entry(who).listen["control"].port for who in commands})
-    return list(commands)
-
-
-def _command(role: Role, file: Path, folder: Path, out: Path, policy: str | None) -> list[str]:
-    words = [sys.executable, "-m", "dwell", role.kind, "--cell", str(file.resolve())]
-    if role.kind == "agent":
-        return [*words, "--node", role.node, "--state", str(folder / role.node)]
-    words += ["--out", str(out), "--state", str(folder.parent)]
-    return [*words, *(() if policy is None else ("--policy", policy))]
+        for role in here:
+            start.run(role, policy)
+        start.wait({role.who: wiring.entry(role.who).listen["control"].port for role in here})
+    return [role.who for role in here]
 
 
 def _require_down(background: Background, wiring: Wiring, file: Path) -> None:
@@ -184,10 +180,9 @@ def _require_ports(problem: Problem, wiring: Wiring, nodes: Sequence[str]) -> No
 class _Start:
     """Start of several processes, which is undone after an error."""
 
-    def __init__(self, folder: Path, out: Path, environment: Mapping[str, str]) -> None:
-        self.folder, self._out, self._environment = folder, out, environment
-        self._was = {path: path.exists() for path in (*folder.parents, folder, out)}
-        self._started: dict[str, subprocess.Popen[bytes]] = {}
+    def __init__(self, processes: NodeProcesses, out: Path) -> None:
+        self.processes, self.folder, self._out = processes, processes.folder, out
+        self._was = {path: path.exists() for path in (*self.folder.parents, self.folder, out)}
         #: Size of each log before the start; None for a new log.
         self._logs: dict[str, int | None] = {}
         self._lock = -1
@@ -208,31 +203,24 @@ class _Start:
         finally:
             os.close(self._lock)
 
-    def run(self, who: str, command: Sequence[str]) -> None:
-        """Start a process in a new session."""
-        path = self.folder / f"{who}.log"
-        length = path.stat().st_size if path.exists() else None
-        if length is not None and length > LOG_BYTES:
-            path.replace(path.with_suffix(".log.1"))
-            length = 0
-        self._logs[who] = length
-        with open(path, "ab", opener=open_own) as log:
-            process = subprocess.Popen(  # noqa: S603 - our own command
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env=dict(self._environment),
-                start_new_session=True,
-            )
-        self._started[who] = process
-        write_mark(self.folder / f"{who}.pid", ProcessGroup.of(process.pid))
+    def run(self, role: Role, policy: str | None) -> None:
+        """Start an agent or the controller in a new session."""
+        log = self.processes.log(role.who)
+        length = log.stat().st_size if log.exists() else None
+        self._logs[role.who] = 0 if shorten_log(log, LOG_BYTES) else length
+        if role.kind == "agent":
+            self.processes.start_agent(role.node)
+        else:
+            more = () if policy is None else ("--policy", policy)
+            self.processes.start_controller_on(role.node, self._out, more)
+        process = self.processes.running[role.who]
+        write_mark(self.folder / f"{role.who}.pid", ProcessGroup.of(process.pid))
 
     def wait(self, ports: Mapping[str, int]) -> None:
         """Wait until all processes listen; raises a LiveError if one ends, or after `START_S`."""
         until_s = time.monotonic() + START_S
         while True:
-            for who, process in self._started.items():
+            for who, process in self.processes.running.items():
                 if (code := process.poll()) is not None:
                     raise LiveError(f"{who} has ended with exit code {code}: {self._last(who)}")
             listening = listening_ports()
@@ -246,28 +234,20 @@ class _Start:
 
     def _last(self, who: str) -> str:
         """Return the last lines that a process has printed since its start."""
-        data = (self.folder / f"{who}.log").read_bytes()[self._logs[who] or 0 :]
+        data = self.processes.log(who).read_bytes()[self._logs[who] or 0 :]
         lines = data.decode(errors="replace").strip().splitlines()[-LAST_LINES:]
         told = "\n".join(map(printable, lines)).removeprefix("error: ")
         return told or "it has printed nothing"
 
     def _undo(self) -> None:
         """End the started processes, and remove the new files and folders."""
-        for process in self._started.values():
-            process.terminate()
-        for process in self._started.values():
-            try:
-                process.wait(END_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
-        for who in self._started:
+        self.processes.end("", END_S)
+        for who, length in self._logs.items():
             # The processes of a killed agent still run.
             _end(_survivors((self.folder / who.partition("@")[2]).glob("*.pid")))
             (self.folder / f"{who}.pid").unlink(missing_ok=True)
-        for who, length in self._logs.items():
             if length is None:
-                (self.folder / f"{who}.log").unlink(missing_ok=True)
+                self.processes.log(who).unlink(missing_ok=True)
         if not self._was[self.folder]:
             shutil.rmtree(self.folder, ignore_errors=True)
         for path in (self._out, *self.folder.parents):

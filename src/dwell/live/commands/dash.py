@@ -32,9 +32,9 @@ def dash(
     shown: Annotated[
         Path | None,
         argument(
-            "CELL|RUN|FLEET",
-            "Cell file of a live cell, or folder of a run or of a fleet's runs; ./cell.yaml "
-            "without it.",
+            "CELL|RUN|FLEET|FOLDER",
+            "Cell file of a live cell, or folder of a run, of a fleet's runs or of several runs "
+            "[default: ./cell.yaml]",
         ),
     ] = None,
     beside: Annotated[

@@ -29,7 +29,6 @@ from dwell.cli.options import (
     require_held,
 )
 from dwell.cli.output import json_text, print_json, proof
-from dwell.display import milliseconds
 from dwell.errors import ExitCode
 from dwell.live.commands.log_format import LogFormat, Logs, begin_log
 from dwell.live.host.state_folder import state_root
@@ -557,6 +556,9 @@ def _ask(
 
 def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
     """Return a status as lines of text, troubles first, and with `stages` also stages and flows."""
+    from dwell.record import shown_reason
+    from dwell.study.metric import METRICS
+
     headline = status["headline"]
     lines = [f"{status['cell']} is {status['health']}: {headline}"] if headline else []
     if status["health"] == "absent":
@@ -587,11 +589,14 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
         )
         ratio = status["release_ratio"]
         released = "" if ratio is None else f"released {ratio:.0%} of one cycle per period, "
+        shown = (METRICS[name] for name in ("l95_ms", "violation_rate", "cost"))
+        metrics = ", ".join(
+            f"{metric.name} {metric.text(window[metric.column])}" for metric in shown
+        )
         lines.append(
-            f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: L95 "
-            f"{milliseconds(window['l95_ms'])} ms, V_D {window['violation_rate']:.1%}, J "
-            f"{window['cost']:.3f}, {window['reason']}; {released}silences {status['silences']}; "
-            f"utilisation {used}"
+            f"window {window['number']}, {window['age_ms'] / 1e3:.1f} s ago: {metrics}, "
+            f"{shown_reason(window['reason'])}; "
+            f"{released}silences {status['silences']}; utilisation {used}"
         )
     for who, topic in status["topics"].items():
         stamp_ms = topic["stamp_ms"]

@@ -43,6 +43,7 @@ from dwell.report.palette import Palette
 from dwell.report.phases import PhaseRow, phase_rows, phase_table
 from dwell.report.run_header import RunHeader
 from dwell.report.table import table_text
+from dwell.study.metric import METRICS
 
 #: File that marks the folder of a live run, which the next run may replace.
 MARK = ".dwell-live-run"
@@ -87,7 +88,7 @@ def run_live(
         typer.echo(f"note: the earlier run in {out}, and its report, are replaced", err=True)
     make_folder(out, MARK, "a live run's")
     problem = on_this_machine(problem)
-    played = _ObservedRun(problem, scenario, seed, timeline)
+    played = ObservedRun(problem, scenario, seed, timeline)
     interrupted = False
     cell = Loopback(problem, out.resolve(), _cpus(problem), seed=seed)
     with interruptible():
@@ -133,7 +134,7 @@ def _announce_left_out() -> tuple[bool, bool]:
 
 
 @dataclass(slots=True)
-class _ObservedRun(Played):
+class ObservedRun(Played):
     """Record of the applied changes and the observer, which the controller does not know."""
 
     observer: CellObserver | None = None
@@ -164,7 +165,7 @@ def _cpus(problem: Problem) -> dict[str, int]:
     }
 
 
-def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
+def _watch_from_start(cell: Loopback, seconds: float, played: ObservedRun) -> None:
     """Start the cell, load its observer, and apply the scenario."""
     with working("starting the cell"):
         cell.start()
@@ -181,7 +182,7 @@ def _watch_from_start(cell: Loopback, seconds: float, played: _ObservedRun) -> N
             played.observer.close()
 
 
-def _watch(cell: Loopback, seconds: float, played: _ObservedRun) -> None:
+def _watch(cell: Loopback, seconds: float, played: ObservedRun) -> None:
     """Apply the changes at their times, and print the state of the cell."""
     status: Mapping[str, Any] = {}
     answered_s, lines = 0.0, Lines()
@@ -247,7 +248,7 @@ def _told(run: Run, out: Path, *, reported: bool) -> _Outcome:
     return replace(outcome, phases=phases, report=page)
 
 
-def _counted(played: _ObservedRun, folder: Path) -> _Outcome:
+def _counted(played: ObservedRun, folder: Path) -> _Outcome:
     """Return the results of a run from its journal, and record the scenario in it."""
     meta, tables = read_plain_journal(folder)
     releases, span = tables["cycles"]["release_ns"], None
@@ -288,9 +289,11 @@ def _print(
             }
         )
         return
-    share = f"{100 * outcome.missed:.1f} % missed, " if outcome.cycles else ""
+    missed = METRICS["violation_rate"].text(outcome.missed)
+    share = f"{missed} missed, " if outcome.cycles else ""
     typer.echo(
-        f"{counted(outcome.cycles, 'cycle')}, {share}{outcome.lost} without a command; "
+        f"{counted(outcome.cycles, 'cycle')} with the warm-up, {share}{outcome.lost} without a "
+        "command; "
         f"{counted(outcome.migrations, 'migration')} by the controller, "
         f"{outcome.guard_moves} by the guard\n"
     )

@@ -10,6 +10,7 @@ from typing import Any
 import typer
 
 from dwell.model.disturbed import Disturbed
+from dwell.study.metric import METRICS
 
 #: Age of the controller's last answer above which the controller is silent.
 SILENT_S = 1.5
@@ -71,8 +72,7 @@ class Lines:
         by_guard = "  by the guard" if status.get("fallback") else ""
         typer.echo(
             f"{state.at_s:6.1f} s  {status.get('placement') or '-'}{by_guard}"
-            f"  L95 {_number(window.get('l95_ms'), 'ms')}"
-            f"  V_D {_number(_hundred(window.get('violation_rate')), '%')}"
+            f"{_metric(window, 'l95_ms')}{_metric(window, 'violation_rate')}"
             f"{_error(state)}"
             f"{'  the controller is silent' if silent else ''}"
             f"  {state.disturbances or 'nothing disturbs it'}"
@@ -89,8 +89,9 @@ def _float(value: object) -> float:
     return float(value) if isinstance(value, int | float) else math.nan
 
 
-def _hundred(value: object) -> float:
-    return 100 * _float(value)
+def _metric(window: Mapping[str, Any], column: str) -> str:
+    metric, value = METRICS[column], _float(window.get(column))
+    return f"  {metric.name} {'-' if math.isnan(value) else metric.text(value)}"
 
 
 def _number(value: object, unit: str) -> str:

@@ -1,26 +1,37 @@
 """Agent: the process on each node that keeps the cell's other processes there running.
 
-It reports the load of the node's CPU. The agent of the relay node also relays small messages. No
-data of stages passes through an agent.
+It sends their beats, and reports the load of the node's CPU. The agent of the relay node also
+relays small messages. No data of stages passes through an agent.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
+import msgspec
 import psutil
 
 from dwell.errors import LiveError
 from dwell.live.failures import start_thread
 from dwell.live.host.supervision import Supervisor
-from dwell.live.roles.role import AGENT_BEAT, Pulse, RolePlace
+from dwell.live.roles.role import AGENT_DELAY, CONTROLLER_BEAT, Pulse, RolePlace, beat_in
 from dwell.live.roles.stage_counts import REPORT_NS
+from dwell.live.roles.worker import SHADOW_BEAT
 from dwell.live.transport.abandoned import OUT_OF_FILES
 from dwell.live.wire.continuity import SetbackDetector
-from dwell.live.wire.keys import TWICE
-from dwell.live.wire.messages import Carried, Load, StageCounts, encode
+from dwell.live.wire.keys import BEATS, TWICE
+from dwell.live.wire.messages import (
+    MAX_HEADER_BYTES,
+    Beat,
+    Beats,
+    Carried,
+    Load,
+    Receipt,
+    StageCounts,
+    encode,
+)
 from dwell.live.wire.relay_batch import MOST_MESSAGES, RelayBatch
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
@@ -32,6 +43,10 @@ LOOK_NS, LOOK_SOON_NS = 200_000_000, 20_000_000
 LOAD_NS = 250_000_000
 #: Period of the checks of the processes' memory and of the size of their logs.
 HOUSEKEEPING_NS = 1_000_000_000
+#: Age in periods from which an agent no longer sends the beat of a process of its node.
+PATIENCE = 2 * SHADOW_BEAT
+#: Length of the notes of beats that are too long for one message.
+SHORT_NOTE = 100
 #: Age from which a gauge's value is invalid.
 GAUGE_S = 2.0
 
@@ -100,15 +115,20 @@ class Agent:
         self._stages: tuple[StageCounts, ...] = ()
         self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
-        # It may beat slowly: no cycle depends on it, so no guard waits for its beats.
-        hears = [place.stamper]
-        if place.seals is not None:
-            # Beats of agents contain the number of their roster.
-            hears += [
-                (role.node, role.who) for role in roles(place.problem) if role.kind == "agent"
-            ]
-        self.pulse = Pulse(place, self._state, hears=hears, every=AGENT_BEAT)
         self._relays = place.node == place.problem.relay_node
+        # Beats of agents contain the number of their roster.
+        everybody = self._relays or place.seals is not None
+        self.offsets = place.offsets()
+        self.pulse = Pulse(
+            *(place, self._state),
+            nodes=["*"] if everybody else self._senders(),
+            offsets=self.offsets,
+        )
+        self._members = [
+            role.who
+            for role in roles(place.problem)
+            if role.node == place.node and role.kind not in ("agent", "controller")
+        ]
         # Periodic tasks with their periods; `_due_ns` has the time of the next call.
         self._chores: dict[Callable[[int], None], int] = {
             lambda _: supervisor.tend(): HOUSEKEEPING_NS,
@@ -122,7 +142,7 @@ class Agent:
         self._gathered = RelayBatch(MOST_MESSAGES // 2)
         self._beats = RelayBatch(MOST_MESSAGES // 2, newest=True)
         self._gather_ns = self._beats_ns = 0
-        self._beat_prefix = place.keys.relay(place.keys.beat("", "").removesuffix("/"))
+        self._send_ns = self._missed_ns = -NEVER_NS
         self._relay_prefix = f"{place.keys.root}/relay/"
         self._setback = SetbackDetector()
         self._read: dict[str, int] = {}
@@ -133,21 +153,34 @@ class Agent:
         yield from self.pulse.subscriptions()
         if self._relays:
             yield self.place.keys.relay(f"{self.place.keys.root}/**")
+            yield self.place.keys.missed()
+
+    def _senders(self) -> set[str]:
+        """Return the nodes whose processes send messages to this node."""
+        node, problem = self.place.node, self.place.problem
+        tasks = problem.pipeline.tasks
+        flows = (flow for flow in problem.pipeline.flows if node in tasks[flow.target].on)
+        senders = {other for flow in flows for other in tasks[flow.source].on}
+        return (senders | {problem.stamper_node}) - {node}
 
     def receive(self, sample: Arrival, now_ns: int) -> int | None:
-        """Read a beat, or queue a message to relay; return when to relay it, if at all."""
-        if self.pulse.hears(sample):
+        """Read beats, or queue messages to relay; return when to relay them, if at all."""
+        keys, period_ns = self.place.keys, self.place.period_ns
+        copied = sample.key.startswith(self._relay_prefix)
+        key = sample.key.removeprefix(self._relay_prefix if copied else f"{keys.root}/")
+        word = key.partition("/")[0]
+        if not copied and self.pulse.hears(sample):
             self.pulse.receive(sample, now_ns)
+        if not self._relays:
             return None
-        if not (self._relays and sample.key.startswith(self._relay_prefix)):
+        if word == "missed":
+            self._missed_ns = now_ns
+        if not (word in TWICE if copied else word == "beats"):
             return None
-        key = sample.key.removeprefix(self._relay_prefix)
-        if key.partition("/")[0] not in TWICE:
-            return None
-        if self._carried.add(key, sample.payload):
-            self._carry_ns = min(self._carry_ns, now_ns + self.place.period_ns // 4)
-        is_beat = sample.key.startswith(self._beat_prefix)
-        (self._beats if is_beat else self._gathered).add(key, sample.payload)
+        (self._beats if word in BEATS else self._gathered).add(key, sample.payload)
+        wanted = copied or 0 <= now_ns - self._missed_ns < 2 * period_ns
+        if wanted and self._carried.add(key, sample.payload):
+            self._carry_ns = min(self._carry_ns, now_ns + period_ns // 4)
         return self._carry_ns
 
     def _state(self) -> tuple[bool, str]:
@@ -172,7 +205,7 @@ class Agent:
         if now_ns >= self._carry_ns:
             self._carry_ns = NEVER_NS
             self._put(self.place.keys.carried(), self._carried.taken())
-        wakes = [self.pulse.wake(now_ns), self._look_due_ns(), *self._due_ns.values()]
+        wakes = [self._beat(now_ns), self._look_due_ns(), *self._due_ns.values()]
         wakes.append(self._carry_ns)
         if self._relays:
             if now_ns >= self._gather_ns:
@@ -180,6 +213,29 @@ class Agent:
                 self._gather_ns = now_ns + self.place.period_ns
             wakes.append(self._gather_ns)
         return min(wakes)
+
+    def _beat(self, now_ns: int) -> int:
+        """Send the beats of the node if they are due; return when the next ones are."""
+        place = self.place
+        period_ns, delay_ns = place.period_ns, place.period_ns // AGENT_DELAY
+        if self._send_ns > now_ns >= self._send_ns - period_ns:
+            return self._send_ns
+        self._send_ns = (now_ns - delay_ns) // period_ns * period_ns + period_ns + delay_ns
+        beats = [self.pulse.made(now_ns)]
+        if place.slots is not None:
+            slots, patience_ns = place.slots, PATIENCE * period_ns
+            found = (beat_in(slots, who, now_ns) for who in self._members)
+            beats += [beat for beat in found if beat and now_ns - beat.sent_ns <= patience_ns]
+            times = {beat.who: beat.sent_ns for beat in beats}
+            slots.write(encode(Receipt(place.life, now_ns, times, self.offsets.interval)))
+        key = place.keys.beats(place.node)
+        payload = place.sealed(key, Beats(tuple(beats)))
+        if len(payload) > MAX_HEADER_BYTES:
+            payload = place.sealed(key, Beats(tuple(_shortened(beats))))
+        place.transport.put(key, payload)
+        if self._relays:
+            self._beats.add(key.removeprefix(f"{place.keys.root}/"), payload)
+        return self._send_ns
 
     def _look_due_ns(self) -> int:
         return self._looked_ns + (LOOK_SOON_NS if self.supervisor.pending else LOOK_NS)
@@ -199,7 +255,7 @@ class Agent:
         messages = self._gathered.taken()
         if now_ns >= self._beats_ns:
             messages += self._beats.taken()
-            self._beats_ns = now_ns + AGENT_BEAT * self.place.period_ns
+            self._beats_ns = now_ns + CONTROLLER_BEAT * self.place.period_ns
         if messages:
             self._put(self.place.keys.gathered(), messages)
 
@@ -226,3 +282,9 @@ class Agent:
         load = Load(place.node, place.life, now_ns, *spent, used, each, self._stages)
         self._stages = ()
         place.put_twice(place.keys.load(place.node), load)
+
+
+def _shortened(beats: Iterable[Beat]) -> Iterator[Beat]:
+    """Yield beats with short notes."""
+    for beat in beats:
+        yield msgspec.structs.replace(beat, note=beat.note[:SHORT_NOTE])

@@ -24,7 +24,7 @@ from dwell.live.host.kept_cell import CellKeeper
 from dwell.live.host.launcher import ForkServer
 from dwell.live.host.security import Security
 from dwell.live.host.service import Service
-from dwell.live.host.state_files import make_folder
+from dwell.live.host.state_files import BeatFiles, make_folder
 from dwell.live.host.supervision import Supervisor
 from dwell.live.log import Log
 from dwell.live.roles.control_group import own_group
@@ -122,6 +122,7 @@ def run_agent(
         security = replace(security, keyring=installed(source, folder / "keys"))
     transport = platform.transport(security, who, node)
     place = security.place(who, node, transport, Log(say))
+    place.slots = BeatFiles(folder, who)
     # Copy the cell only now: if the start has failed, the user can correct the file.
     if keeper is not None:
         keeper.begin(stopped)

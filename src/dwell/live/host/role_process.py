@@ -25,6 +25,7 @@ from dwell.live.host.lowest_class import take_lowest_class
 from dwell.live.host.security import Security
 from dwell.live.host.stage_modules import actuator_of, stage_of
 from dwell.live.host.state_files import (
+    BeatFiles,
     BookFile,
     HighestFile,
     InFlight,
@@ -78,7 +79,7 @@ def run_process(
 def _run(
     role: Named, place: RolePlace, folder: Path, stopped: threading.Event, clock: Clock
 ) -> bool:
-    problem = place.problem
+    problem, place.slots = place.problem, BeatFiles(folder, role.who)
     # Switch threads often: a beat must not wait for a computing stage.
     sys.setswitchinterval(0.0005)
     # The control group counts the CPU time of a node with a quota.
@@ -193,7 +194,7 @@ def _print(line: str) -> None:
 class _Broken(Pulse):
     """Replaces a worker whose stage cannot be loaded, and reports the error."""
 
-    def receive(self, sample: Arrival, now_ns: int) -> None:
+    def receive(self, sample: Arrival, now_ns: int) -> None:  # type: ignore[override]
         super().receive(sample, now_ns)
 
 

@@ -101,12 +101,12 @@ class Security:
         wiring = wire(self.problem, protocol=self._protocol)
         # Twice the peers: old connections may still be open when all processes restart.
         most_peers = 2 * wiring.peers(who) + VISITORS_AT_ONCE
-        return ZenohTransport(wiring.entry(who), self._settings(most_peers))
+        return ZenohTransport(wiring.entry(who), self.settings(most_peers))
 
     def visit(self, who: str, *to: str) -> ZenohTransport:
         """Open a session of a visitor, which is outside of the cell, to processes of the cell."""
         wiring = wire(self.problem, protocol=self._protocol)
-        return ZenohTransport(wiring.visitor(who, *to), self._settings(VISITORS_AT_ONCE))
+        return ZenohTransport(wiring.visitor(who, *to), self.settings(VISITORS_AT_ONCE))
 
     def place(
         self, who: str, node: str, transport: Transport, say: Callable[[str], None]
@@ -152,7 +152,8 @@ class Security:
     def _protocol(self) -> str:
         return "tcp" if self.keyring is None else "tls"
 
-    def _settings(self, most_peers: int) -> ZenohSettings:
+    def settings(self, most_peers: int) -> ZenohSettings:
+        """Return the settings of a session with at most `most_peers` peers."""
         tls = {} if self.keyring is None else _tls(self.problem, self.keyring)
         return ZenohSettings(
             longest_bytes=longest_message_bytes(self.problem, "images"),

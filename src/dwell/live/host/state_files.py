@@ -21,7 +21,7 @@ _CYCLE = struct.Struct("<qq")
 _LENGTH = struct.Struct("<QI")
 # Number of writes, length of the content, and a checksum of both.
 _SLOT = struct.Struct("<QII")
-_BOOK_BYTES = 2_048
+_BOOK_BYTES, _BEAT_BYTES = 2_048, 16_384
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 #: Bits of a folder's mode that permit writes by its group or by all users.
 OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
@@ -114,19 +114,28 @@ class _Slots:
         self._file = _identity(path)
         self._number = 0
         self.content = b""
+        self.read()
+
+    def read(self) -> bytes:
+        """Return the newest content, which another process may have written."""
+        self._follow()
         for begin in (0, self._size):
             number, length, check = _SLOT.unpack_from(self._map, begin)
             content = self._map[begin + _SLOT.size : begin + _SLOT.size + length]
             if number > self._number and zlib.crc32(content, number & 0xFFFFFFFF) == check:
                 self._number, self.content = number, content
+        return self.content
+
+    def _follow(self) -> None:
+        """Map the file again if it was removed; if that fails, keep the old map."""
+        if _identity(self._path) != self._file:
+            with suppress(OSError):
+                self._map = _mapped(self._path, 2 * self._size)
+                self._file, self._number = _identity(self._path), 0
 
     def write(self, content: bytes) -> None:
         """Overwrite the older slot."""
-        if _identity(self._path) != self._file:
-            # If the removed file cannot be restored yet, write to the old map.
-            with suppress(OSError):
-                self._map = _mapped(self._path, 2 * self._size)
-                self._file = _identity(self._path)
+        self._follow()
         self._number, self.content = self._number + 1, content
         begin = self._number % 2 * self._size
         place = begin + _SLOT.size
@@ -180,6 +189,32 @@ class HighestFile:
     def store(self, run: int, cycle: int) -> None:
         """Save run and number of the cycle."""
         self._slots.write(_CYCLE.pack(run, cycle))
+
+
+class BeatFiles:
+    """Slots of a node's processes in its folder; `who` is the process that writes."""
+
+    def __init__(self, folder: Path, who: str) -> None:
+        self._folder, self._who = folder, who
+        self._slots: dict[str, _Slots] = {}
+
+    def write(self, content: bytes) -> None:
+        """See `BeatSlots`; content that does not fit, and a full disk, leave the slot as it is."""
+        if len(content) <= _BEAT_BYTES and (slots := self._of(self._who)) is not None:
+            slots.write(content)
+
+    def read(self, who: str) -> bytes:
+        """See `BeatSlots`."""
+        slots = self._of(who)
+        return b"" if slots is None else slots.read()
+
+    def _of(self, who: str) -> _Slots | None:
+        if who not in self._slots:
+            try:
+                self._slots[who] = _Slots(self._folder / f"{who}.beat", _BEAT_BYTES)
+            except LiveError:
+                return None
+        return self._slots[who]
 
 
 class InFlight:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dwell.errors import LiveError, ProblemError
 from dwell.model import bounds
 from dwell.model.instants import NEVER_NS
-from dwell.model.process import AR1, Constant, LogNormal, Process, Trace
+from dwell.model.process import AR1, Constant, Process, Trace
 from dwell.model.scenario import ADDED_LOSS
 
 #: Scheduling of a link's process: real-time priority, short time slices, or the default.
@@ -111,7 +111,7 @@ def _whole_ns(delays_ms: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _remembering(process: AR1, rng: np.random.Generator) -> Iterator[int]:
-    mu, sigma = LogNormal(process.mean, process.cv).log_parameters
+    mu, sigma = process.log_parameters
     r = process.log_correlation
     fresh = math.sqrt(1 - r * r)
     state = rng.standard_normal()

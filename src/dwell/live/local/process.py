@@ -1,9 +1,9 @@
 """Entry point of agents, controllers and other processes with emulated faults, for a testbed.
 
 ``python -m dwell.live.local.process [--links FILE] [--clocks FILE] COMMAND ...`` works like ``dwell
-COMMAND ...`` for ``agent`` and ``controller`` (with the same options), and like ``python -m
-dwell.live.host.role_command`` for ``process``. A `LinkFile` delays and drops the messages of the
-process, and a `ClockFile` shifts its clock.
+COMMAND ...`` for ``agent`` and ``controller`` (with the options that a testbed needs), and like
+``python -m dwell.live.host.role_command`` for ``process``. A `LinkFile` delays and drops the
+messages of the process, and a `ClockFile` shifts its clock.
 """
 
 from __future__ import annotations
@@ -11,13 +11,13 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from dwell.errors import ExitCode, line_and_code
 from dwell.live.host import role_command
 from dwell.live.host.hosting import Clock, Platform
-from dwell.live.host.security import INSECURE, Security
+from dwell.live.host.security import Security
 from dwell.live.local.clocks import wrong_clock
 from dwell.live.local.linked_transport import LinkedTransport
 from dwell.live.local.message_links import LinkEnds
@@ -73,12 +73,15 @@ def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
     """Run an agent or a controller."""
     from dwell.live.host import node_command
 
-    run: Callable[..., None] = node_command.agent
-    parser = _agent_parser()
-    if command == "controller":
-        run, parser = node_command.controller, _controller_parser()
+    parser = _parser(command)
+    options = vars(parser.parse_args(words))
+    file, jobs = options.pop("cell"), os.environ.get("DWELL_JOBS", "")
     try:
-        run(**vars(parser.parse_args(words)), platform=platform)
+        if command == "agent":
+            node_command.agent(cell=file, **options, platform=platform)
+        else:
+            options.setdefault("jobs", jobs.lower() in ("1", "on", "t", "true", "y", "yes"))
+            node_command.controller([file], **options, platform=platform)
     except node_command.OptionError as error:
         parser.error(str(error))
     except Exception as error:
@@ -91,43 +94,27 @@ def _run_node(command: str, words: Sequence[str], platform: Platform) -> int:
     return ExitCode.DONE
 
 
-def _agent_parser() -> argparse.ArgumentParser:
-    parser = _parser("agent")
-    parser.add_argument("--node", required=True)
+def _parser(command: str) -> argparse.ArgumentParser:
+    """Return a parser of the options that testbeds and restarts give to a command.
+
+    The `dwell` command would need 0.2 s more per start for its parser.
+    """
+    parser = argparse.ArgumentParser(
+        command, allow_abbrev=False, argument_default=argparse.SUPPRESS
+    )
     parser.add_argument("--cell", type=Path, required=True)
     parser.add_argument("--state", type=Path)
-    parser.add_argument("--cpus-of", action="append", default=[])
-    parser.add_argument("--realtime", action="append", default=[])
-    parser.add_argument("--accelerator")
-    parser.add_argument("--renews", action="store_true")
-    return parser
-
-
-def _controller_parser() -> argparse.ArgumentParser:
-    parser = _parser("controller")
-    parser.add_argument("--cell", dest="cells", action="append", type=Path, required=True)
-    parser.add_argument("--out", type=Path, default=Path("runs"))
-    parser.add_argument("--state", type=Path)
-    parser.add_argument("--policy")
-    parser.add_argument("--continues", default="{}")
-    parser.add_argument("--name")
-    parser.add_argument("--jobs", action=argparse.BooleanOptionalAction, default=_set("DWELL_JOBS"))
-    return parser
-
-
-def _parser(command: str) -> argparse.ArgumentParser:
-    """Return a parser with the common options of agents and controllers."""
-    parser = argparse.ArgumentParser(command, allow_abbrev=False)
     parser.add_argument("--cpus")
-    parser.add_argument("--keys", type=Path)
-    parser.add_argument("--insecure", action="store_true", default=_set(INSECURE))
     parser.add_argument("--owner", type=int)
+    if command == "agent":
+        parser.add_argument("--node", required=True)
+        parser.add_argument("--renews", action="store_true")
+        return parser
+    parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--policy")
+    parser.add_argument("--continues")
+    parser.add_argument("--jobs", action="store_true")
     return parser
-
-
-def _set(variable: str) -> bool:
-    """Return whether a variable of the environment is true, by the rules of the `dwell` command."""
-    return os.environ.get(variable, "").lower() in ("1", "on", "t", "true", "y", "yes")
 
 
 if __name__ == "__main__":

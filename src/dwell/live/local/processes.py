@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
-import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
 from dwell.cellfile.yaml_text import yaml_of
+from dwell.live.host.node_processes import NodeProcesses
 from dwell.live.host.parent_death import OPTION, end_those_of, start_sweeper
 from dwell.live.local.trace_names import move_traces
 from dwell.live.transport.orphans import remove_orphans
@@ -68,8 +67,8 @@ def with_hosts(problem: Problem, address: Callable[[str], str], first_port: int)
     return replace(problem, live=replace(problem.live, hosts=hosts))
 
 
-class Processes:
-    """Agents and controller of a cell.
+class Processes(NodeProcesses):
+    """Agents and controller of a cell in a testbed; all end with their owner.
 
     Parameters
     ----------
@@ -85,20 +84,11 @@ class Processes:
         CPU of each node; a missing node uses any CPU.
     more : sequence of str
         Further arguments of the controller.
-    program : sequence of str
-        Module that runs agents and controllers, and its first arguments.
-    popen : callable
-        Starts a command like `Popen`.
+    program, popen : optional
+        See `NodeProcesses`.
     owner : str, optional
         Id of the process, on the computer of the nodes, with which all processes end [default: this
         process].
-
-    Attributes
-    ----------
-    running : dict of str to Popen
-        Running processes by name, such as ``agent@R1`` and ``controller@E``.
-    file : Path
-        Cell file.
     """
 
     def __init__(
@@ -114,14 +104,18 @@ class Processes:
         popen: Callable[..., subprocess.Popen[bytes]] = subprocess.Popen,
         owner: str | None = None,
     ) -> None:
-        self.problem, self.folder, self.file = problem, folder, folder / "cell.yaml"
-        self.running: dict[str, subprocess.Popen[bytes]] = {}
         # Processes import modules from the folder of the original cell file.
         paths = [problem.folder, os.environ.get("PYTHONPATH")] if problem.folder else []
         modules = {"PYTHONPATH": os.pathsep.join(filter(None, paths))} if paths else {}
-        self.environment = {**modules, **(environment or {})}
-        self._program = tuple(program)
-        self._popen = popen
+        super().__init__(
+            *(folder / "cell.yaml", folder),
+            root=folder,
+            environment={**without_keys(), **modules, **(environment or {})},
+            program=program,
+            popen=popen,
+            process_group=0,
+        )
+        self.problem = problem
         self._owner = str(os.getpid()) if owner is None else owner
         self._inside, self._cpus, self._more = inside, dict(cpus or {}), tuple(more)
         self._sweeper: subprocess.Popen[bytes] | None = None
@@ -133,36 +127,23 @@ class Processes:
         move_traces(document, Path(self.problem.folder or "").resolve())
         self.file.write_text(yaml_of(document), encoding="utf-8")
 
-    def start_agent(self, node: str) -> None:
-        """Start or restart a node's agent."""
-        self._start("agent", node, ["--node", node, "--state", str(self.folder / node)])
-
     def start_controller(self, *, out: Path | None = None, more: Sequence[str] = ()) -> None:
         """Start or restart the controller, with further arguments `more`.
 
         `out` is the folder for the runs' folders [default: ``runs``].
         """
         runs = self.folder / "runs" if out is None else out
-        words = ["--out", str(runs), "--state", str(self.folder), *self._more, *more]
-        self._start("controller", self.problem.controller_node, words)
+        self.start_controller_on(self.problem.controller_node, runs, [*self._more, *more])
 
-    def _start(self, kind: str, node: str, words: Sequence[str]) -> None:
+    def _start(self, who: str, words: Sequence[str]) -> None:
         if self._sweeper is None:
             self._sweeper = start_sweeper()
-        command = [sys.executable, "-m", *self._program, kind, *words, OPTION, self._owner]
-        if node in self._cpus:
-            command += ["--cpus", str(self._cpus[node])]
-        command += ["--cell", str(self.file)]
-        who = f"{kind}@{node}"
-        with (self.folder / f"{who}.log").open("ab") as log:
-            self.running[who] = self._popen(
-                self._inside(node, command),
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                env={**without_keys(), **self.environment},
-                process_group=0,
-            )
+        cpu = self._cpus.get(who.partition("@")[2])
+        cpus = [] if cpu is None else ["--cpus", str(cpu)]
+        super()._start(who, [*words, OPTION, self._owner, *cpus])
+
+    def _on(self, node: str, command: Sequence[str]) -> Sequence[str]:
+        return self._inside(node, command)
 
     def forget(self, node: str) -> None:
         """Remove the processes of a node that have all been killed."""
@@ -172,12 +153,12 @@ class Processes:
 
     def stop_controller(self) -> None:
         """End the controller and wait until it has written its run."""
-        self._end("controller@", CONTROLLER_STOP_S)
+        self.end("controller@", CONTROLLER_STOP_S)
 
     def stop(self) -> None:
         """End all processes, the agents after the controller, and remove their shared memory."""
         self.stop_controller()
-        self._end("", STOP_S)
+        self.end("", STOP_S)
         # On a busy machine, processes of the lowest scheduling class outlive a killed agent.
         end_those_of(self._owner, self.file, KILL_S)
         if self._sweeper is not None:
@@ -185,22 +166,3 @@ class Processes:
             self._sweeper.wait()
             self._sweeper = None
         remove_orphans()
-
-    def _end(self, begin: str, patience_s: float) -> None:
-        """End the processes whose names begin with a prefix."""
-        names = [who for who in self.running if who.startswith(begin)]
-        end_all([self.running.pop(who) for who in names], patience_s)
-
-
-def end_all(processes: Iterable[subprocess.Popen[bytes]], patience_s: float) -> None:
-    """Send SIGTERM to processes, and kill the processes that still run after `patience_s`."""
-    ending = list(processes)
-    for process in ending:
-        process.terminate()
-    deadline = time.monotonic() + patience_s
-    for process in ending:
-        try:
-            process.wait(max(deadline - time.monotonic(), 0.1))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()

@@ -18,7 +18,7 @@ from dwell.control import Controller, Proposal
 from dwell.errors import LiveError
 from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.roles.live_windows import LiveWindows
-from dwell.live.roles.role import AGENT_BEAT, REPEATED_NS, Pulse, RolePlace
+from dwell.live.roles.role import CONTROLLER_BEAT, REPEATED_NS, Pulse, RolePlace
 from dwell.live.roles.run_rows import Resume, Rows
 from dwell.live.wire.continuity import Continuity, SetbackDetector
 from dwell.live.wire.keys import CONTROLLER
@@ -27,7 +27,6 @@ from dwell.live.wire.messages import (
     Accepted,
     Answer,
     Ask,
-    Beat,
     Order,
     Restored,
     Snapshot,
@@ -115,11 +114,9 @@ class ControlledCell:
         self._recorder, self._changed = recorder, changed
         self.offsets = place.offsets()
         self.windows: LiveWindows | None = None
-        # Other processes' beats arrive in batches of the relay's agent. Beats carry their own
-        # times of sending and arrival, so a delay on the detour does not harm clock comparisons.
-        relay = place.problem.relay_node
-        agent = relay, f"agent@{relay}"
-        self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=[agent], every=AGENT_BEAT)
+        # Beats arrive in batches of the relay's agent. They carry their own times of sending and
+        # arrival, so a delay on the detour does not harm clock comparisons.
+        self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=(), every=CONTROLLER_BEAT)
         self._keys = place.keys
         # Run, term and placement from the stamper's answers and stamps; its last answer, or None
         # if only stamps have confirmed the current term.
@@ -137,7 +134,7 @@ class ControlledCell:
         self.pinned = ""
         self.drained: set[str] = set()
         self._move: _Move | None = None
-        self._number = now_ns
+        self.order_number = now_ns
         self._setback = SetbackDetector()
         self._began_ns: int | None = None
         self._ask_ns = 0
@@ -206,9 +203,9 @@ class ControlledCell:
                 self._take(arrival, now_ns)
             return
         if self.pulse.hears(sample):
-            beat = self.pulse.receive(sample, now_ns)
-            if beat is not None:
-                self._compare_clocks(beat, now_ns, direct=keys.came_directly(sample.key))
+            for beat, _, _ in self.pulse.receive(sample, now_ns):
+                for heard in beat.heard:
+                    self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
                 if beat.moving and self._move is not None:
                     # A stage is writing or restoring its state.
                     self._move.since_ns = now_ns
@@ -241,14 +238,6 @@ class ControlledCell:
         except LiveError as error:
             self.place.complain(error)
 
-    def _compare_clocks(self, beat: Beat, now_ns: int, *, direct: bool) -> None:
-        """Compare clocks by a beat; from the detour, only by its sender's own receptions."""
-        if direct:
-            self.offsets.hear(beat, now_ns)
-        else:
-            for heard in beat.heard:
-                self.offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
-
     def _require_candidate(self, placement: str) -> None:
         """Raise a LiveError if the stamper's placement is not a candidate here."""
         known = self.place.problem.candidates
@@ -266,7 +255,7 @@ class ControlledCell:
         terms = stamp.term - course.term if course.run == stamp.run else 0
         if terms <= ahead and continuity.takes(cycle, now_ns, alone=alone):
             if continuity.newest == cycle != newest:
-                self._cycle_asked = self._number
+                self._cycle_asked = self.order_number
             return True
         if terms > ahead:
             continuity.leaps += 1
@@ -318,7 +307,7 @@ class ControlledCell:
         controller, course, move = self.controller, self.course, self._move
         left = course.placement
         self._unconfirmed = self._told = None
-        self._term_asked = self._number
+        self._term_asked = self.order_number
         self.refused = ""
         if move is not None and move.name == placement and not by_guard:
             self._move, self._unwritten = None, True
@@ -346,7 +335,7 @@ class ControlledCell:
 
     def _begin_run(self, answer: Accepted) -> None:
         """Start with the run and placement of the stamper's first answer."""
-        self._term_asked = self._number
+        self._term_asked = self.order_number
         resume = self._recorder.open(answer.run)
         self._follow(answer)
         self.windows = LiveWindows(self.place.problem, self.offsets, self.controller, resume=resume)
@@ -368,7 +357,7 @@ class ControlledCell:
         if answer.controller != self.name:
             return
         self._require_candidate(answer.placement)
-        if answer.number > self._number:
+        if answer.number > self.order_number:
             raise LiveError(f"an answer to order {answer.number}, which was never sent")
         begins = self.windows is None
         if begins:
@@ -376,7 +365,7 @@ class ControlledCell:
         elif not self._corrected(answer, now_ns):
             return
         # The clock of an earlier controller may have been ahead of this controller's.
-        self._number = max(self._number, answer.newest)
+        self.order_number = max(self.order_number, answer.newest)
         if begins:
             return
         course, move, proven = self.course, self._move, self._proven
@@ -416,13 +405,13 @@ class ControlledCell:
         ahead = continuity.ahead(now_ns)
         if newest is None or newest[0] < answer.run or answer.cycle > newest[1] + ahead:
             continuity.believe((answer.run, answer.cycle - 1), now_ns)
-            self._cycle_asked = self._number
+            self._cycle_asked = self.order_number
         elif upcoming <= newest and answer.number > self._cycle_asked:
             self.place.complain(
                 LiveError(f"the stamper has not stamped cycle {newest[1]}; {answer.cycle} is next")
             )
             continuity.believe((answer.run, answer.cycle - 1), now_ns)
-            self._cycle_asked = self._number
+            self._cycle_asked = self.order_number
             if windows is not None:
                 windows.forget(answer.run, answer.cycle)
         return True
@@ -434,7 +423,7 @@ class ControlledCell:
                 f"the stamper is in term {answer.term}, at {answer.placement}; so it was not moved"
             )
         )
-        self._term_asked = self._number
+        self._term_asked = self.order_number
         self._stay(f"the stamper says that {answer.placement} holds")
         self._follow(answer)
 
@@ -454,8 +443,8 @@ class ControlledCell:
         self.place.put(self.place.keys.order(), order)
 
     def _next_number(self) -> int:
-        self._number += 1
-        return self._number
+        self.order_number += 1
+        return self.order_number
 
     def _order(self, placement: str, now_ns: int) -> Order:
         """Return an order; every order also has the forks and the candidate to prove."""

@@ -570,7 +570,7 @@ class Ledger:
             tables["work_ns"][tables["end_ns"] > close_ns] = UNKNOWN
             for name in ("ready_ns", "start_ns", "end_ns", "arrived_ns"):
                 tables[name][tables[name] > close_ns] = UNKNOWN
-        return Evidence(
+        return Evidence.of(
             close_ns=close_ns,
             release_ns=release_ns,
             placement=np.array([self._codes[cycle.placement] for cycle in cycles], np.int64),

@@ -1,7 +1,8 @@
 """Failure detector: age of the last beat of each process, received directly or over the detour.
 
-Every process sends one beat per period. A beat lists the last beats that its sender has received.
-With this list other nodes detect failed links, and compare clocks (see `offsets`).
+Every process makes one beat per period, which its agent sends. A beat lists the last beats that
+its maker has received. With this list other nodes detect failed links, and compare clocks (see
+`offsets`).
 """
 
 from __future__ import annotations
@@ -75,6 +76,12 @@ class FailureDetector:
         process = self._processes.get(who)
         return process.age_ns(now_ns) if process is not None else None
 
+    def direct_age_ns(self, who: str, now_ns: int) -> int | None:
+        """Time since the last direct beat of a process; None before its first direct beat."""
+        process = self._processes.get(who)
+        at_ns = None if process is None else process.direct_ns
+        return None if at_ns is None else now_ns - at_ns
+
     def joined_age_ns(self, now_ns: int) -> int | None:
         """Time since the last process sent its first beat; None before the first beat."""
         if self._joined_ns is None:
@@ -88,12 +95,13 @@ class FailureDetector:
         limit = self.patience_ns if patience_ns is None else patience_ns
         return age_ns is not None and age_ns <= limit
 
-    def heard(self) -> tuple[Heard, ...]:
-        """Return the last direct beat of every process, for the next beat."""
+    def heard(self, now_ns: int) -> tuple[Heard, ...]:
+        """Return the last direct beats of at most twice `patience_ns` ago, for the next beat."""
         return tuple(
             Heard(who, process.beat.node, process.direct_beat_ns, process.direct_ns)
             for who, process in self._processes.items()
             if process.direct_ns is not None
+            and 0 <= now_ns - process.direct_ns <= 2 * self.patience_ns
         )
 
     def everybody(self, now_ns: int) -> list[tuple[str, Beat, int]]:

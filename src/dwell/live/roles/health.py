@@ -22,14 +22,16 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
-from dwell.live.roles.role import AGENT_BEAT
+from dwell.live.roles.role import CONTROLLER_BEAT
 from dwell.live.wire.messages import STALE
 from dwell.live.wire.wiring import Role, lane_of, roles
 from dwell.model import Problem
 from dwell.model.bounds import counted
+from dwell.study.metric import METRICS
 
 Health: TypeAlias = Literal["ok", "degraded", "stalled", "silent", "absent"]
 
+RATE = METRICS["violation_rate"]
 #: Least age at which a process counts as silent; a busy machine may be late without a fault.
 LEAST_NS = 1_000_000_000
 #: Time after which an unfinished migration is given up; until then it may delay a window.
@@ -45,10 +47,10 @@ BAD_WINDOWS = 2
 def silent_after_ns(problem: Problem) -> int:
     """Return the age of the last beat above which a process is silent.
 
-    The age is the guard's g periods plus the controller's delay: agents beat every `AGENT_BEAT`
-    periods, and the relay's agent passes beats on at the same interval.
+    The age is the guard's g periods, and twice the `CONTROLLER_BEAT` periods after which the
+    relay's agent passes beats on.
     """
-    periods = problem.controller.guard_cycles + 2 * AGENT_BEAT
+    periods = problem.controller.guard_cycles + 2 * CONTROLLER_BEAT
     return max(round(periods * problem.pipeline.period_ms * 1e6), LEAST_NS)
 
 
@@ -179,8 +181,8 @@ def _symptoms(
     why = [*slow, *unreached, *_notes(status, names)]
     yield from _uneven(problem, status, why)
     if problem.live.degraded_by(rates):
-        rate = sum(rates) / len(rates)
-        yield f"V_D is {rate:.0%} in the last {counted(len(rates), 'window')}{_because(why)}"
+        rate = RATE.text(sum(rates) / len(rates))
+        yield f"{RATE.name} is {rate} in the last {counted(len(rates), 'window')}{_because(why)}"
     for name, found in status["failing"].items():
         placed = problem.candidates[name].items()
         if not {node for _, node in placed}.isdisjoint(status["drained"]):

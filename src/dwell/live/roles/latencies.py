@@ -3,8 +3,8 @@
 A cycle begins with its release by the stamper. It ends when the stamper receives its last
 completion, minus the transmission time of the completion. This time is estimated as half of the
 best round trip to the sink's node in the last one or two minutes. A beat gives the round trip: it
-states which beat of the stamper its sender received last, and how long before. The rest of the time
-since the stamper's beat is the round trip.
+states which beat of the stamper's node its sender received last, and how long before. The rest of
+the time since that beat is the round trip. On the stamper's own node the time is taken as 0.
 
 Other clocks are not needed. The estimate assumes that the best way back takes half of the best
 round trip, and that the completion took the best way; any extra delay becomes part of the interval.
@@ -52,18 +52,18 @@ class _Waiting:
 
 
 class Intervals:
-    """See the module; `who` is the name of the stamper."""
+    """See the module; `node` is the stamper's."""
 
-    def __init__(self, who: str, sinks: Collection[str]) -> None:
-        self._who, self._sinks = who, frozenset(sinks)
-        self._best: dict[str, _Best] = {}
+    def __init__(self, node: str, sinks: Collection[str]) -> None:
+        self._node, self._sinks = node, frozenset(sinks)
+        self._best = {node: _Best(0, 0)}
         self._waiting: dict[int, _Waiting] = {}
         self._unreported: list[tuple[int, int]] = []
 
     def hear(self, beat: Beat, now_ns: int) -> None:
         """Measure the round trip to a node by a direct beat."""
         for heard in beat.heard:
-            if heard.who == self._who:
+            if heard.node == self._node:
                 held_ns = beat.sent_ns - heard.at_ns
                 best = self._best.setdefault(beat.node, _Best(now_ns))
                 best.take(max(now_ns - heard.beat_ns - held_ns, 0), now_ns)

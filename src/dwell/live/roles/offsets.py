@@ -50,6 +50,14 @@ class Instant(NamedTuple):
     bound_ns: int
 
 
+class ClockOffset(NamedTuple):
+    """Offset of a node's clock: between `low_ns` and `high_ns` at `t_ns` of the reference."""
+
+    t_ns: int = -NEVER_NS
+    low_ns: int = -UNBOUNDED_NS
+    high_ns: int = UNBOUNDED_NS
+
+
 class _Pair:
     """Offset of a node's clock from the reference's: an interval at an instant of the reference."""
 
@@ -124,6 +132,25 @@ class Offsets:
         self._pairs: dict[str, _Pair] = {}
         #: Time at which the last received beat was sent, by sender.
         self._said_ns: dict[str, int] = {}
+        self._adopted_life: int | None = None
+
+    @property
+    def interval(self) -> ClockOffset:
+        """Offset of this node's clock, for other processes of this node."""
+        pair = self._pairs.get(self.node)
+        return ClockOffset() if pair is None else ClockOffset(pair.t_ns, pair.low_ns, pair.high_ns)
+
+    def adopt(self, interval: ClockOffset, life: int) -> None:
+        """Use the interval of the node's agent, of a life.
+
+        A restarted agent has compared no clocks: then the last interval stays valid.
+        """
+        if interval.low_ns > -UNBOUNDED_NS and interval.high_ns < UNBOUNDED_NS:
+            self._adopted_life = life
+        elif life != self._adopted_life:
+            return
+        pair = self._pairs.setdefault(self.node, _Pair())
+        pair.t_ns, pair.low_ns, pair.high_ns = interval
 
     def hear(self, beat: Beat, at_ns: int) -> None:
         """Add a beat that arrived at `at_ns` on this node's clock; it may be late or a copy."""

@@ -12,18 +12,20 @@ import msgspec
 from dwell.errors import LiveError, TrustError
 from dwell.live.log import printable
 from dwell.live.roles.failure_detector import FailureDetector
-from dwell.live.roles.offsets import Offsets
-from dwell.live.wire.keys import CONTROLLER, TWICE, Keys
+from dwell.live.roles.offsets import ClockOffset, Offsets
+from dwell.live.wire.keys import BEATS, CONTROLLER, RELAYED, Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
     SIGNATURE_BYTES,
     Beat,
+    Beats,
     Carried,
     Completion,
     Header,
     Heard,
     Load,
     Rates,
+    Receipt,
     Stamp,
     decode,
     encode,
@@ -46,8 +48,10 @@ MAX_STRANGERS = 256
 REPEATED_NS = 10_000_000_000
 #: Number of beats from an earlier life that shows two running processes with one name.
 RIVAL_BEATS = 5
-#: Periods between two beats of an agent, and between two reports of another process's beats.
-AGENT_BEAT = 5
+#: Periods between two beats of the controller, and between two reports of beats to it.
+CONTROLLER_BEAT = 5
+#: Delay of an agent's beats after the beats of its node, as a part of the period.
+AGENT_DELAY = 4
 
 if TYPE_CHECKING:
     from dwell.live.trust.signing import Seals
@@ -63,6 +67,27 @@ class BeatState(NamedTuple):
     run: int = 0
     moving: bool = False
     rates: Rates | None = None
+
+
+class ReceivedBeat(NamedTuple):
+    """A new beat, and whether it did not come over the detour.
+
+    `at_ns` is its arrival, less the time that its agent had it.
+    """
+
+    beat: Beat
+    at_ns: int
+    direct: bool
+
+
+class BeatSlots(Protocol):
+    """Memory that the processes of a node share; each process has a slot."""
+
+    def write(self, content: bytes) -> None:
+        """Replace the content of this process's slot."""
+
+    def read(self, who: str) -> bytes:
+        """Return the content of a process's slot; empty if there is none."""
 
 
 class RoleLogic(Protocol):
@@ -87,7 +112,8 @@ class RolePlace:
     """Name, node and transport of a process; reads, writes, signs and checks its messages.
 
     `who` is unique in the cell; `life` grows with every start of the process. `complaints` counts
-    unusable messages by reason. Without `seals` messages are not signed.
+    unusable messages by reason. Without `seals` messages are not signed; without `slots` no agent
+    sends this process's beats.
     """
 
     problem: Problem
@@ -98,6 +124,7 @@ class RolePlace:
     complaints: dict[str, int] = field(default_factory=dict)
     say: Callable[[str], None] | None = None
     seals: Seals | None = None
+    slots: BeatSlots | None = None
     complained: int = 0
     last_complaint: str = ""
     #: Keys of its cell, and P.
@@ -137,9 +164,10 @@ class RolePlace:
 
     def put(self, key: str, message: msgspec.Struct) -> None:
         """Send a small message, signed if there are keys."""
-        self.transport.put(key, self._sealed(key, message))
+        self.transport.put(key, self.sealed(key, message))
 
-    def _sealed(self, key: str, message: msgspec.Struct) -> bytes:
+    def sealed(self, key: str, message: msgspec.Struct) -> bytes:
+        """Return an encoded message, signed if there are keys."""
         data = encode(message)
         return data if self.seals is None else self.seals.seal(self.keys.word(key), data)
 
@@ -205,20 +233,31 @@ class RolePlace:
             raise LiveError(f"{sample.key}: the load of {load.node}")
         return load
 
-    def beat(self, sample: Arrival) -> Beat:
-        """Read a beat; raise a LiveError if it is not a beat, or if its sender is not in its key.
+    def beats(self, sample: Arrival) -> tuple[Beat, ...]:
+        """Read a beat, or the beats of a node.
 
-        Access control has checked the certificate of a direct beat's sender. The signature is
-        checked only for a beat from the detour.
+        Raises a LiveError if it is neither, or if a beat is of a process for which the key's
+        sender may not send. Access control has checked the certificate of the sender of direct
+        beats. The signature is checked only for beats from the detour.
         """
         signed = 0 if self.seals is None else SIGNATURE_BYTES
-        beat = decode(sample.payload[signed:], Beat)
-        if not sample.key.endswith(f"/{beat.node}/{beat.who}"):
-            raise LiveError(f"{sample.key}: a beat of {beat.who} on {beat.node}")
+        data = sample.payload[signed:]
+        controller = f"controller@{self.problem.controller_node}"
+        if self.keys.word(sample.key) == "beats":
+            beats = decode(data, Beats).beats
+            node = sample.key.rpartition("/")[2]
+            good = beats[0].who == f"agent@{node}"
+            good &= all(beat.node == node and beat.who != controller for beat in beats)
+        else:
+            beats = (decode(data, Beat),)
+            good = sample.key.endswith(f"/{beats[0].node}/{beats[0].who}")
+        if not good:
+            names = ", ".join(f"{beat.who} on {beat.node}" for beat in beats[:3])
+            raise LiveError(f"{sample.key}: a beat of {names}")
         if not self.keys.came_directly(sample.key):
-            controls = beat.who == f"controller@{self.problem.controller_node}"
-            self._require(sample, CONTROLLER if controls else beat.node)
-        return beat
+            controls = beats[0].who == controller
+            self._require(sample, CONTROLLER if controls else beats[0].node)
+        return beats
 
     def put_twice(self, key: str, message: msgspec.Struct) -> None:
         """Send a small message directly and over the detour, signed if there are keys.
@@ -226,7 +265,7 @@ class RolePlace:
         Processes on the relay's own node do this too: the detour reaches processes without a
         direct connection to the sender.
         """
-        payload = self._sealed(key, message)
+        payload = self.sealed(key, message)
         self.transport.put(key, payload)
         self.transport.put(self.keys.relay(key), payload)
 
@@ -239,7 +278,7 @@ class RolePlace:
             return []
         keys = self.keys
         arrivals = [Arrival(keys.detour(key), payload) for key, payload in carried.messages]
-        fit = [arrival for arrival in arrivals if keys.word(arrival.key) in TWICE]
+        fit = [arrival for arrival in arrivals if keys.word(arrival.key) in RELAYED]
         if len(fit) < len(arrivals):
             self.complain(LiveError(f"{sample.key}: has what never takes the detour"))
         return fit
@@ -272,11 +311,17 @@ class RolePlace:
 
 
 class Pulse:
-    """Beats that a process sends and receives.
+    """Beats that a process makes and receives.
+
+    The process writes its beat into its slot, and the agent of the node sends it with the others.
+    If the agent's receipt for the last beat is missing, the process sends the beat itself. Then the
+    stamper and all others do, too, so that the node hears them and they hear the node.
 
     `state` returns whether the process is ready, and the reason if not or its last problem; `holds`
     returns the optional fields of the beat. `hears` names the nodes and processes (or ``*``)
-    whose beats it receives, by default the stamper's only. It sends one beat per `every` periods.
+    whose own beats it receives, by default the stamper's only, and `nodes` the nodes (or ``*``)
+    whose agents' beats. It makes one beat per `every` periods. Direct beats, and receipts, set
+    `offsets`.
     """
 
     def __init__(
@@ -286,65 +331,75 @@ class Pulse:
         holds: Callable[[], BeatState] = BeatState,
         *,
         hears: Iterable[tuple[str, str]] | None = None,
+        nodes: Iterable[str] = (),
         every: int = 1,
+        offsets: Offsets | None = None,
     ) -> None:
-        self.place = place
-        self._hears = (place.stamper,) if hears is None else tuple(hears)
+        self.place, self._offsets = place, offsets
+        hears = (place.stamper,) if hears is None else hears
+        keys = place.keys
+        self._heard = (*(keys.beat(*one) for one in hears), *map(keys.beats, nodes))
         self.detector = FailureDetector(place.who, place.patience_ns)
         self._state, self._holds = state, holds
         self._every_ns = every * place.period_ns
         self._digest = digests(place.problem)["wiring"]
         self._nodes = frozenset(place.problem.fabric.nodes)
         self._known = {role.who: role.node for role in roles(place.problem)}
-        self._next_ns = self._sent_ns = -NEVER_NS
+        self._next_ns = -NEVER_NS
+        #: Instant until which the process sends its beats itself, too.
+        self.alone_until_ns = -NEVER_NS
         #: Rejected senders, by name: the reason, and the time of the last beat.
         self.strangers: dict[str, tuple[str, int]] = {}
         self._rivals: dict[str, int] = {}
         self._complained = 0
         self._repeat_until_ns = -NEVER_NS
-        keys = place.keys
         self._key = keys.beat(place.node, place.who)
         self._returned = keys.detour(self._key)
-        direct = keys.beat("", "").removesuffix("/")
-        self._prefix = direct, keys.detour(direct)
-        # Last direct beat by sender: an equal copy from the detour is skipped without decoding.
+        # Last direct beats by key: an equal copy from the detour is skipped without decoding.
         self._detoured: dict[str, bytes] = {}
 
     def subscriptions(self) -> tuple[str, ...]:
         """Key expressions of the beats to subscribe to."""
-        keys = self.place.keys
-        return tuple(keys.beat(node, who) for node, who in self._hears)
+        return self._heard
 
-    def receive(self, sample: Arrival, now_ns: int) -> Beat | None:
-        """Process a beat; return it if it is valid and new, else None."""
-        if not sample.key.startswith(self._prefix):
-            return None
-        if self._is_copy(sample):
-            return None
+    def receive(self, sample: Arrival, now_ns: int) -> list[ReceivedBeat]:
+        """Process beats; return those that are valid and new."""
+        if not self.hears(sample) or self._is_copy(sample):
+            return []
         try:
-            beat = self.place.beat(sample)
+            beats = self.place.beats(sample)
         except LiveError as error:
             who = sample.key.rpartition("/")[2]
             reason = f"{who}: {error}; does Dwell {__version__} run there, as here?"
             self.place.complain(LiveError(reason))
-            return None
-        if differs := self._differs(beat):
-            self._note_stranger(beat.who, differs, now_ns)
-            return None
-        self.strangers.pop(beat.who, None)
-        direct = sample.key.startswith(self._prefix[0])
-        if direct:
-            self._look_for_rival(beat)
-        return beat if self.detector.hear(beat, now_ns, direct=direct) else None
+            return []
+        keys, sent_ns, new = self.place.keys, beats[0].sent_ns, []
+        direct = keys.came_directly(sample.key)
+        alone = direct and keys.word(sample.key) == "beat"
+        for beat in beats:
+            if differs := self._differs(beat):
+                self._note_stranger(beat.who, differs, now_ns)
+                continue
+            self.strangers.pop(beat.who, None)
+            if direct and beat is beats[0]:
+                self._look_for_rival(beat)
+            # The agent has had the beats of the other processes for a while.
+            at_ns = now_ns - max(sent_ns - beat.sent_ns, 0)
+            if self.detector.hear(beat, at_ns, direct=direct):
+                new.append(ReceivedBeat(beat, at_ns, direct))
+                if direct and self._offsets is not None:
+                    self._offsets.hear(beat, at_ns)
+                if alone and (beat.alone or beat.who == self.place.stamper[1]):
+                    self.alone_until_ns = now_ns + self.place.patience_ns
+        return new
 
     def _is_copy(self, sample: Arrival) -> bool:
-        """Whether a beat is a copy of the sender's last direct beat, or this process's own beat."""
-        direct, detour = self._prefix
-        if sample.key == self._returned:
-            return True
-        if sample.key.startswith(detour):
-            return self._detoured.get(sample.key[len(detour) :]) == sample.payload
-        name = sample.key[len(direct) :]
+        """Whether these are the sender's last direct beats again, or this process's own beat."""
+        keys = self.place.keys
+        if not keys.came_directly(sample.key):
+            known = self._detoured.get(sample.key)
+            return sample.key == self._returned or known == sample.payload
+        name = keys.detour(sample.key)
         if name in self._detoured or len(self._detoured) < MAX_STRANGERS:
             self._detoured[name] = sample.payload
         return False
@@ -389,50 +444,77 @@ class Pulse:
             self.place.complain(LiveError(reason))
         self._rivals[beat.who] = count
 
-    def compare_clocks(self, sample: Arrival, now_ns: int, offsets: Offsets) -> None:
-        """Process a beat; if it came directly, use it to compare the clocks."""
-        beat = self.receive(sample, now_ns)
-        if beat is not None and self.place.keys.came_directly(sample.key):
-            offsets.hear(beat, now_ns)
-
     def hears(self, sample: Arrival) -> bool:
-        """Whether a message is a beat."""
-        return sample.key.startswith(self._prefix)
+        """Whether a message has beats."""
+        return self.place.keys.word(sample.key) in BEATS
 
     def wake(self, now_ns: int) -> int:
-        """Send the beat if it is due; return the instant of the next one."""
+        """Make the beat if it is due; return the instant of the next one.
+
+        All processes of a node make their beats at the same instants, just before their agent's.
+        """
         # If the next beat is due later than one interval from now, the clock was set back.
-        back = self._next_ns > now_ns + self._every_ns
-        if back or now_ns >= self._next_ns:
-            self.send(now_ns)
-            late = now_ns >= self._next_ns + self._every_ns
-            self._next_ns = (now_ns if late or back else self._next_ns) + self._every_ns
+        if now_ns >= self._next_ns or self._next_ns > now_ns + self._every_ns:
+            self._next_ns = (now_ns // self._every_ns + 1) * self._every_ns
+            alone = not self._is_sent(now_ns)
+            beat = self.made(now_ns, alone=alone)
+            self._put(beat, alone=alone or now_ns < self.alone_until_ns)
         return self._next_ns
 
-    def put_off(self, due_ns: int) -> None:
-        """Move the next beat to an instant, at most half an interval late."""
-        self._next_ns = min(due_ns, self._sent_ns + self._every_ns * 3 // 2)
-
     def send(self, now_ns: int) -> None:
-        """Send a beat."""
-        self._sent_ns = now_ns
-        ready, note = self._state()
-        self._put(now_ns, ready, note or self._repeated(now_ns), self.detector.heard())
+        """Send a beat at once."""
+        self._put(self.made(now_ns))
 
     def send_alone(self, now_ns: int, *, ready: bool, note: str) -> None:
         """Send a beat from another thread while the role is busy, without its state."""
-        self._put(now_ns, ready, note, ())
+        self._put(self._made(now_ns, ready, note, ()))
 
-    def _put(self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...]) -> None:
+    def _is_sent(self, now_ns: int) -> bool:
+        """Whether the agent sends this process's beats; adopts its comparison of the clocks."""
+        place, slots = self.place, self.place.slots
+        if slots is None:
+            return True
+        try:
+            receipt = decode(slots.read(f"agent@{place.node}"), Receipt)
+        except LiveError:
+            return False
+        late_ns = place.period_ns * 3 // 2
+        if not 0 <= now_ns - receipt.sent_ns <= late_ns:
+            return False
+        if self._offsets is not None:
+            self._offsets.adopt(ClockOffset(*receipt.clock), receipt.life)
+        return now_ns - receipt.beats.get(place.who, -NEVER_NS) <= self._every_ns + late_ns
+
+    def own(self, who: str, now_ns: int) -> None:
+        """Read the beat of another process of this node from its slot."""
+        slots = self.place.slots
+        if slots is not None and (beat := beat_in(slots, who, now_ns)) is not None:
+            self.detector.hear(beat, beat.sent_ns)
+
+    def made(self, now_ns: int, *, alone: bool = False) -> Beat:
+        """Return a new beat."""
+        ready, note = self._state()
+        note, heard = note or self._repeated(now_ns), self.detector.heard(now_ns)
+        return self._made(now_ns, ready, note, heard, alone=alone)
+
+    def _made(
+        self, now_ns: int, ready: bool, note: str, heard: tuple[Heard, ...], *, alone: bool = False
+    ) -> Beat:
         place = self.place
         term, placement, run, moving, rates = self._holds()
         keyring = None if place.seals is None else place.seals.keyring
         keys = (0, 0) if keyring is None else (keyring.own.generation, keyring.roster.number)
-        beat = Beat(
+        return Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys, rates),
+            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys, alone, rates),
         )
-        place.put_twice(self._key, beat)
+
+    def _put(self, beat: Beat, *, alone: bool = True) -> None:
+        slots = self.place.slots
+        if slots is not None:
+            slots.write(encode(beat))
+        if alone or slots is None:
+            self.place.put_twice(self._key, beat)
 
     def _repeated(self, now_ns: int) -> str:
         """Return the last complaint if it is at most `REPEATED_NS` old; else an empty string."""
@@ -446,3 +528,12 @@ class Pulse:
 def _series(version: str) -> str:
     """Return major and minor version; they must be equal for processes to work together."""
     return ".".join(version.split(".")[:2])
+
+
+def beat_in(slots: BeatSlots, who: str, now_ns: int) -> Beat | None:
+    """Return the beat in a process's slot; None without a beat of this boot."""
+    try:
+        beat = decode(slots.read(who), Beat)
+    except LiveError:
+        return None
+    return beat if beat.who == who and beat.sent_ns <= now_ns else None

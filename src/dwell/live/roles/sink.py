@@ -49,7 +49,7 @@ class Sink:
         self.offsets = place.offsets()
         #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
-        self.pulse = Pulse(place, self._state, self._passed)
+        self.pulse = Pulse(place, self._state, self._passed, offsets=self.offsets)
         self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, STALE: 0, "silences": 0}
         # Errors of the actuator at the last command, and at the last call of `hold` or `zero`.
         self.trouble = self._restless = ""
@@ -69,7 +69,7 @@ class Sink:
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a command or a beat."""
         if self.pulse.hears(sample):
-            self.pulse.compare_clocks(sample, now_ns, self.offsets)
+            self.pulse.receive(sample, now_ns)
             return
         header = self.place.header(sample)
         if header is None or header.source != self.task:

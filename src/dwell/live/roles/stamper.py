@@ -31,6 +31,7 @@ from dwell.live.wire.messages import (
 )
 from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
+from dwell.model.instants import NEVER_NS
 
 #: Time without orders after which another controller may take over.
 LEASE_NS = 1_000_000_000
@@ -97,7 +98,9 @@ class Stamper:
         #: Run, term and placement of the cell.
         self.course = self.guard.course
         self.course.enter(entry.run, entry.term)
-        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")])
+        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")], nodes=["*"])
+        self._agents = [f"agent@{node}" for node in problem.fabric.nodes]
+        self._asked_ns = -NEVER_NS
         self.timer = problem.live.release == "timer"
         self._next_ns = now_ns + place.period_ns
         self._framed_ns = now_ns - place.period_ns
@@ -111,16 +114,16 @@ class Stamper:
         self._sinks = frozenset(
             name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
         )
-        self.intervals = Intervals(place.who, self._sinks)
+        self.intervals = Intervals(place.node, self._sinks)
         self._partial: dict[int, set[str]] = {}
-        self._fraction = 0.0
-        self._forks: tuple[tuple[str, str], ...] = ()
+        self.shadow_fraction = 0.0
+        self.forks: tuple[tuple[str, str], ...] = ()
         self._charge = ""
         self._charged_ns = 0
         self._answered: tuple[str, int, Accepted] | None = None
         #: Highest number of an accepted order; a new controller's numbers are higher, because they
         #: begin with the time of day.
-        self._newest = 0
+        self.newest_order = 0
         #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
@@ -158,9 +161,8 @@ class Stamper:
                 self.receive(arrival, now_ns)
             return
         if self.pulse.hears(sample):
-            beat = self.pulse.receive(sample, now_ns)
-            if beat is not None:
-                self._heard(beat, now_ns, self.place.keys.came_directly(sample.key))
+            for beat in self.pulse.receive(sample, now_ns):
+                self._heard(*beat)
             return
         try:
             match word := self.place.keys.word(sample.key):
@@ -189,6 +191,7 @@ class Stamper:
         self._release(now_ns, now_ns)
 
     def _heard(self, beat: Beat, now_ns: int, direct: bool) -> None:
+        """Process a beat that arrived at `now_ns`."""
         presence = self.guard.presence
         presence.heard(beat.node, now_ns)
         if direct:
@@ -200,7 +203,7 @@ class Stamper:
             age_ns = max(beat.sent_ns - heard.at_ns, 0)
             presence.heard(f"{heard.node}->{beat.node}", now_ns - age_ns)
         worker, _, extra = beat.who.partition(".")
-        if beat.moving and self._forks and beat.who in self._workers():
+        if beat.moving and self.forks and beat.who in self._workers():
             # The worker is saving its state for a migration, so its cycles wait.
             self.guard.restart()
         if extra in ("", "1") and "@" in worker:
@@ -284,7 +287,7 @@ class Stamper:
             self._next,
             self.course.by_guard,
             probed if probation.proven(probed, now_ns) else "",
-            self._newest,
+            self.newest_order,
             self.guard.resting,
             probed,
             probation.done(now_ns) if probed else 0,
@@ -309,8 +312,8 @@ class Stamper:
             return f"infeasible: {order.placement!r} is no candidate ({', '.join(self._names)})"
         if order.placement == self.placement:
             return ""
-        if order.number < self._newest:
-            return f"stale order: {order.number}, after {self._newest}"
+        if order.number < self.newest_order:
+            return f"stale order: {order.number}, after {self.newest_order}"
         missing = self.guard.presence.missing(order.placement, now_ns)
         if missing:
             return f"not ready: {', '.join(sorted(missing))} not heard"
@@ -331,16 +334,16 @@ class Stamper:
     def _accept(self, order: Order) -> None:
         if order.run == 0 and order.term == 0:
             return
-        if order.number > self._newest:
-            self._newest = order.number
+        if order.number > self.newest_order:
+            self.newest_order = order.number
             self._settle(order)
         if order.placement and (order.placement != self.placement or self.course.by_guard):
             self._move(order.placement, by_guard=False)
 
     def _settle(self, order: Order) -> None:
         """Adopt the shadow fraction, the forks and the wanted candidate of the newest order."""
-        self._fraction = order.shadow_fraction
-        self._forks = order.forks
+        self.shadow_fraction = order.shadow_fraction
+        self.forks = order.forks
         if self.course.by_guard:
             known = order.want in self.place.problem.candidates
             self.guard.probation.want(order.want if known else None)
@@ -349,9 +352,9 @@ class Stamper:
         """Change the placement: begin a new term, saved before any cycle has it."""
         if by_guard:
             self._ahead = None
-            self._forks = ()
+            self.forks = ()
             # The next order of the controller sets the shadow fraction of the fallback.
-            self._fraction = 0.0
+            self.shadow_fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
         self._partial.clear()
@@ -382,13 +385,25 @@ class Stamper:
             self._next_ns += behind * self.place.period_ns
             self._release(self._next_ns, now_ns)
             self._next_ns += self.place.period_ns
-        due_ns = self.pulse.wake(now_ns)
+        due_ns = min(self.pulse.wake(now_ns), self._miss(now_ns))
         if self.timer:
             due_ns = min(due_ns, self._next_ns)
         guard_ns = self.guard.due_ns
         # While no fallback is complete, the guard looks again every quarter of a period.
         again_ns = now_ns + self.place.period_ns // 4
         return due_ns if guard_ns is None else min(due_ns, max(guard_ns, again_ns))
+
+    def _miss(self, now_ns: int) -> int:
+        """Ask the relay for beats of nodes that are missing; return when others would be."""
+        period_ns, detector = self.place.period_ns, self.pulse.detector
+        late_ns = period_ns * 5 // 4
+        ages = [detector.direct_age_ns(who, now_ns) for who in self._agents]
+        missing = any(age_ns is None or age_ns > late_ns for age_ns in ages)
+        if missing and not 0 <= now_ns - self._asked_ns < period_ns:
+            self._asked_ns = now_ns
+            self.place.transport.put(self.place.keys.missed(), b"")
+        due_ns = [now_ns + late_ns - age_ns for age_ns in ages if age_ns and age_ns <= late_ns]
+        return min(due_ns, default=now_ns + period_ns) + 1
 
     def _begin_anew(self, now_ns: int) -> None:
         """Restart timer and guard after the clock was set back."""
@@ -436,8 +451,6 @@ class Stamper:
         if stamp.shadow:
             self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
-        # Beats wake every process and would delay the source, so send the next one mid-period.
-        self.pulse.put_off(released_ns + self.place.period_ns // 2)
         intervals = self.intervals.take_unreported()
         stamped = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
         self.place.transport.put(self.place.keys.stamped(), encode(stamped))
@@ -463,14 +476,14 @@ class Stamper:
         shadow = wanted or self._shadowed(cycle)
         if shadow == self.placement:
             shadow = ""
-        return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self._forks)
+        return Stamp(self.run, cycle, self.term, self.placement, released_ns, shadow, self.forks)
 
     def _shadowed(self, cycle: int) -> str:
         """Return the candidate of this cycle's shadow by the estimator's plan; empty if none."""
-        if not self._fraction:
+        if not self.shadow_fraction:
             return ""
         code = self._names.index(self.placement)
-        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self._fraction)
+        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self.shadow_fraction)
         return self._names[int(plan[0])] if plan[0] >= 0 else ""
 
     # --------------------------------------------------------------------------- beats

@@ -284,7 +284,8 @@ class Worker:
         # The guard ignores shadow workers, so they can beat less often.
         slow = SHADOW_BEAT if shadow else 1
         hears = [place.stamper, *hears]
-        self.pulse = Pulse(place, self._state, self._moves, hears=hears, every=slow)
+        given = place, self._state, self._moves
+        self.pulse = Pulse(*given, hears=hears, every=slow, offsets=self.offsets)
 
     # ---------------------------------------------------------------------- receiving
 
@@ -305,7 +306,7 @@ class Worker:
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a message."""
         if self.pulse.hears(sample):
-            self.pulse.compare_clocks(sample, now_ns, self.offsets)
+            self.pulse.receive(sample, now_ns)
             return
         kind = sample.key.rpartition("/")[2]
         if kind in (MAIN, SHADOW) and "/in/" in sample.key:
@@ -543,6 +544,7 @@ class Worker:
         if not self.stands_by:
             return True
         detector = self.pulse.detector
+        self.pulse.own(self.stands_by, self._now_ns)
         beat = detector.last(self.stands_by)
         patience_ns = 2 * self.place.period_ns
         return not (

@@ -83,7 +83,7 @@ _PRIORITIES = (
 
 
 @lru_cache(maxsize=1_024)
-def _mark(key: str) -> bytes:
+def mark_of(key: str) -> bytes:
     """Return the mark of a key, which is part of each message with this key.
 
     Zenoh sends a number instead of a key that was declared in a session. After a restart of a
@@ -137,13 +137,13 @@ class ZenohTransport:
         self.failed = 0
         self._failures: set[str] = set()
         # Used without a lock: a superfluous publisher does no harm.
-        self._routes: dict[tuple[str, Lane], _Route] = {}
+        self._routes: dict[tuple[str, Lane], KeyRoute] = {}
         self._locks: dict[Lane, threading.RLock] = {
             "control": threading.RLock(),
             "images": threading.RLock(),
         }
         self._growing = threading.Lock()
-        self._pool: _Pool | None = None
+        self._pool: PayloadPool | None = None
         self._sessions: dict[Session, zenoh.Session] = {}
         try:
             for name in entry.sessions:
@@ -154,7 +154,7 @@ class ZenohTransport:
         self._connections.start()
         self._abandoned.start()
         if "local" in self._sessions:
-            self._pool = _Pool.of()
+            self._pool = PayloadPool.of()
 
     def put(
         self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
@@ -257,7 +257,7 @@ class ZenohTransport:
                 f"{f' on {where}' if where else ''}: {why or error}"
             ) from None
 
-    def _route(self, key: str, lane: Lane) -> _Route | None:
+    def _route(self, key: str, lane: Lane) -> KeyRoute | None:
         """Declare a publisher in the session of a key and a lane; None if it is closed."""
         require_key(key)
         name = session_of(self.entry, lane, key)
@@ -281,7 +281,7 @@ class ZenohTransport:
                 return None
             raise
         pool = self._pool if name == "local" else None
-        route = _Route(publisher.put, pool, mark=_mark(key))
+        route = KeyRoute(publisher.put, pool, mark=mark_of(key))
         while len(self._routes) >= _PUBLISHERS:
             dropped = self._routes.pop(next(iter(self._routes)), None)
             if dropped is not None and dropped.sender is not None:
@@ -289,16 +289,16 @@ class ZenohTransport:
         self._routes[key, lane] = route
         return route
 
-    def _sender(self, route: _Route) -> _Sender:
+    def _sender(self, route: KeyRoute) -> PatientSender:
         """Return the thread of a key, which puts all further messages of the key."""
         with self._growing:
             if route.sender is None:
-                route.sender = _Sender(route, self._send)
+                route.sender = PatientSender(route, self._send)
                 if self._closed:
                     route.sender.stop()
             return route.sender
 
-    def _send(self, route: _Route, content: Any, header: bytes) -> None:
+    def _send(self, route: KeyRoute, content: Any, header: bytes) -> None:
         try:
             route.put(content, attachment=route.mark + header)
         except self._zenoh.ZError:
@@ -311,7 +311,7 @@ class ZenohTransport:
         attachment, key = sample.attachment, str(sample.key_expr)
         header = b"" if attachment is None else attachment.to_bytes()
         if header.startswith(MARK):
-            if not header.startswith(_mark(key)):
+            if not header.startswith(mark_of(key)):
                 self.misled += 1
                 if self.misled == 1:
                     who = self.entry.role.who
@@ -346,13 +346,13 @@ def _keep_thread_state() -> None:
 
 
 @dataclass(slots=True)
-class _Route:
+class KeyRoute:
     """Publisher of a key and lane."""
 
     put: Callable[..., None]
-    pool: _Pool | None
+    pool: PayloadPool | None
     #: Thread that sends all messages of the key after its first large payload, to keep their order.
-    sender: _Sender | None = None
+    sender: PatientSender | None = None
     mark: bytes = b""
     #: Whether the session has been closed.
     closed: bool = False
@@ -364,10 +364,10 @@ class _Route:
         return self.pool.filled(data)
 
 
-class _Sender:
+class PatientSender:
     """Thread that puts the newest messages of one key, and may wait for the network."""
 
-    def __init__(self, route: _Route, send: Callable[[_Route, Any, bytes], None]) -> None:
+    def __init__(self, route: KeyRoute, send: Callable[[KeyRoute, Any, bytes], None]) -> None:
         self._route = route
         self._send = send
         self._changed = threading.Condition()
@@ -401,7 +401,7 @@ class _Sender:
                 _LOG.exception("a payload of %d bytes could not be sent", len(data))
 
 
-class _Pool:
+class PayloadPool:
     """Shared memory for copies of payloads, which stay as long as a receiver needs them."""
 
     def __init__(self, pool_bytes: int) -> None:
@@ -413,7 +413,7 @@ class _Pool:
         self._policy = shm.Defragment(shm.GarbageCollect())
 
     @classmethod
-    def of(cls, pool_bytes: int = POOL_BYTES) -> _Pool | None:
+    def of(cls, pool_bytes: int = POOL_BYTES) -> PayloadPool | None:
         """Return a pool, or None if the system lacks shared memory for it."""
         try:
             room = os.statvfs(SHARED_MEMORY)
@@ -484,7 +484,7 @@ def _configuration(entry: WiringEntry, name: Session, settings: ZenohSettings) -
         ),
         "transport/unicast/max_sessions": settings.most_peers,
         "transport/shared_memory/enabled": name == "local",
-        # `_Pool` puts payloads there, and falls back to sockets when it is full.
+        # `PayloadPool` puts payloads there, and falls back to sockets when it is full.
         "transport/shared_memory/transport_optimization/enabled": False,
         **settings.more,
     }

@@ -72,7 +72,7 @@ class Authority:
             decipher_only=False,
         )
         certificate = (
-            _builder(name, name, key.public_key(), _now() + timedelta(days=10 * days))
+            _builder(name, name, key.public_key(), now() + timedelta(days=10 * days))
             .serial_number(x509.random_serial_number())
             .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
             .add_extension(usage, critical=True)
@@ -174,13 +174,13 @@ class Authority:
         serial = x509.random_serial_number()
         generation = 1 + max(before.generation if before else 0, self._last_generation(name))
         public = key.public_bytes(Encoding.Raw, PublicFormat.Raw)
-        expires = min(_now() + timedelta(days=days), self.certificate.not_valid_after_utc)
+        expires = min(now() + timedelta(days=days), self.certificate.not_valid_after_utc)
         encoded = base64.b64encode(public).decode()
         played = cast("Role", role or (before.role if before else None))
-        instants = _now().isoformat(), expires.isoformat()
+        instants = now().isoformat(), expires.isoformat()
         subject = Subject(name, played, generation, serial, encoded, *instants)
-        names = self._names(name) if addresses is None else map(_general_name, addresses)
-        certificate = self._certificate(subject, key, list(dict.fromkeys(names)), expires)
+        names = self._names(name) if addresses is None else map(general_name, addresses)
+        certificate = self.certificate_of(subject, key, list(dict.fromkeys(names)), expires)
         folder = self.folder / name
         make_private_folder(folder)
         if secret is None:
@@ -190,7 +190,7 @@ class Authority:
         write_private(folder / "cert.pem", certificate.public_bytes(Encoding.PEM))
         write_private(folder / "ca.pem", self.certificate.public_bytes(Encoding.PEM))
         subjects = {**roster.subjects, name: subject}
-        earlier = [one for one in (*roster.earlier, before) if one and one.ends > _now()]
+        earlier = [one for one in (*roster.earlier, before) if one and one.ends > now()]
         self._publish(replace(roster, subjects=subjects, earlier=tuple(earlier)))
         return folder
 
@@ -239,13 +239,14 @@ class Authority:
         for name in (AUTHORITY, *self.roster.subjects):
             write_private(self.folder / name / "roster.json", signed)
 
-    def _certificate(
+    def certificate_of(
         self,
         subject: Subject,
         key: Ed25519PublicKey,
         names: Sequence[x509.GeneralName],
         expires: datetime,
     ) -> x509.Certificate:
+        """Return a signed certificate of a subject, until `expires`."""
         uses = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
         builder = (
             _builder(common_name(subject.common_name), self.certificate.subject, key, expires)
@@ -266,16 +267,18 @@ def _builder(
         .subject_name(subject)
         .issuer_name(issuer)
         .public_key(key)
-        .not_valid_before(_now() - BACKDATED)
+        .not_valid_before(now() - BACKDATED)
         .not_valid_after(expires)
     )
 
 
-def _now() -> datetime:
+def now() -> datetime:
+    """Return the time of day in whole seconds."""
     return datetime.now(UTC).replace(microsecond=0)
 
 
-def _general_name(address: str) -> x509.GeneralName:
+def general_name(address: str) -> x509.GeneralName:
+    """Return an address or a host's name as a name of a certificate."""
     try:
         return x509.IPAddress(ipaddress.ip_address(address))
     except ValueError:

@@ -27,6 +27,7 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
         **_of_stages(problem, keys),
         keys.ended(): everywhere,
         keys.stamped(): frozenset([stamper]),
+        keys.missed(): frozenset([stamper]),
         keys.accepted(): frozenset([stamper]),
         keys.order(): frozenset([CONTROLLER]),
         keys.answer("*"): frozenset([CONTROLLER]),
@@ -39,7 +40,7 @@ def senders(problem: Problem) -> dict[str, frozenset[str]]:
         sender = CONTROLLER if role.kind == "controller" else role.node
         by_key[keys.beat(role.node, role.who)] = frozenset([sender])
     for node in problem.fabric.nodes:
-        by_key[keys.load(node)] = frozenset([node])
+        by_key[keys.load(node)] = by_key[keys.beats(node)] = frozenset([node])
     # Senders of messages that are sent twice may also send them to the relay.
     by_key |= {keys.relay(key): who for key, who in by_key.items() if keys.word(key) in TWICE}
     return by_key

@@ -7,6 +7,9 @@ MAIN, SHADOW = "main", "shadow"
 CONTROLLER = "controller"
 #: First words of the keys of messages that are sent twice, directly and over the detour.
 TWICE = frozenset({"accepted", "beat", "done", "ended", "load"})
+#: First words of the keys of beats, and of all messages that the relay passes on.
+BEATS = frozenset({"beat", "beats"})
+RELAYED = TWICE | BEATS
 
 
 class Keys:
@@ -35,6 +38,14 @@ class Keys:
     def beat(self, node: str, who: str) -> str:
         """Heartbeats; ``*`` for all nodes or processes."""
         return f"{self.root}/beat/{node}/{who}"
+
+    def beats(self, node: str) -> str:
+        """Heartbeats of all processes of a node, from its agent; ``*`` for all nodes."""
+        return f"{self.root}/beats/{node}"
+
+    def missed(self) -> str:
+        """Requests of the stamper to the relay for the beats that it misses."""
+        return f"{self.root}/missed"
 
     def stamped(self) -> str:
         """Stamps of all cycles."""

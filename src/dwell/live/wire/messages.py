@@ -244,6 +244,8 @@ class Beat(_Array, frozen=True):
         Whether a worker is saving or restoring a state for a migration.
     generation, roster : int
         Generation of the process's certificate, and number of its roster; 0 without keys.
+    alone : bool
+        Whether the agent of its node does not send its beats, so that it sends them itself.
     rates : Rates, optional
         The topic that a source reads, if it reads one.
     """
@@ -263,7 +265,37 @@ class Beat(_Array, frozen=True):
     moving: bool = False
     generation: Count = 0
     roster: Count = 0
+    alone: bool = False
     rates: Rates | None = None
+
+
+class Beats(_Array, frozen=True):
+    """Beats of all processes of a node, from its agent; the agent's own beat is the first.
+
+    The agent sends it when it makes its own beat, so the difference between the times of the first
+    and of another beat is the age of the other.
+    """
+
+    beats: Annotated[tuple[Beat, ...], msgspec.Meta(min_length=1, max_length=1_000)]
+
+
+class Receipt(_Array, frozen=True):
+    """An agent's receipt for the beats of its node; it stays on the node.
+
+    Parameters
+    ----------
+    life, sent_ns : int
+        Life of the agent, and the time at which it sent the beats.
+    beats : dict of str to int
+        Times of the beats of the processes.
+    clock : tuple of int
+        Offset of the node's clock (see `dwell.live.roles.offsets.ClockOffset`).
+    """
+
+    life: int
+    sent_ns: int
+    beats: dict[str, int]
+    clock: tuple[int, int, int]
 
 
 class Order(_Array, frozen=True):

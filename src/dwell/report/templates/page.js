@@ -1,5 +1,5 @@
 "use strict";
-// Draws the page's figures again, with what can be chosen and seen; sorts its tables.
+// Replaces the page's pictures with interactive figures, and sorts its tables.
 (() => {
   const views = [];
   const narrow = 600;
@@ -7,6 +7,8 @@
   // A drawing was made for the page's width: parts that are wider than a small screen are fitted.
   function fit(spec, room) {
     if (room >= narrow) return spec;
+    // Names of rows leave room for the marks; the pointer shows a name that is cut off.
+    spec.config.axis.labelLimit = 92;
     const lone = (part) => {
       if (typeof part !== "object" || part === null) return;
       if ("columns" in part && ("facet" in part || "concat" in part)) part.columns = 1;
@@ -21,19 +23,36 @@
     return spec;
   }
 
+  // Lowers the indices of symbols in a drawing, as in the rest of the page: V_D.
+  const symbol = new RegExp(document.body.dataset.symbol);
+  function lowered(text) {
+    const [first, ...parts] = text.textContent.split(symbol);
+    const part = (words, style) => {
+      const span = document.createElementNS(text.namespaceURI, "tspan");
+      span.textContent = words;
+      for (const [name, value] of Object.entries(style)) span.setAttribute(name, value);
+      return span;
+    };
+    const written = [first];
+    for (let i = 0; i < parts.length; i += 3)
+      written.push(parts[i], part(parts[i + 1], { dy: ".3em", "font-size": "75%" }), part(parts[i + 2], { dy: "-.225em" }));
+    if (parts.length) text.replaceChildren(...written);
+  }
+
   function draw(figure, spec) {
     const place = document.createElement("div");
     const options = { ast: true, actions: false, renderer: "svg", hover: true };
     return vegaEmbed(place, fit(spec, figure.clientWidth), options).then((result) => {
       figure.replaceChildren(place);
+      place.querySelectorAll("svg text").forEach(lowered);
       figure.classList.add("live");
       const signals = result.view.getState().signals;
-      // What stands in place of policies elsewhere (links, say) is not the form's to choose.
+      // The form chooses policies only; the lines of some figures are other things, such as links.
       views.push({ view: result.view, lines: signals.policies, seeds: "seed" in signals });
     });
   }
 
-  // One after the other, so that the page stays at hand; what is folded, when it is opened.
+  // Draw the figures one by one, to keep the page responsive; folded figures when they are opened.
   async function drawAll(part) {
     for (const figure of part.querySelectorAll("[data-figure]:not(.live)")) {
       if (figure.closest("details:not([open])")) continue;
