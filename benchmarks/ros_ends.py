@@ -68,7 +68,7 @@ class Stamped(Actuator):
         os.write(self._file, RECORD.pack(command.cycle, command.stamp_ns or 0, now_ns))
 
 
-class Publishing(ros2.Sink):  # type: ignore[name-defined, misc]
+class Publishing(ros2.Sink):  # type: ignore[misc]
     """The same behind a ROS topic."""
 
     def __init__(self) -> None:
@@ -157,10 +157,11 @@ def _network() -> Iterator[subprocess.Popen[str]]:
     try:
         for what in ("router", "talk", "listen"):
             command = [sys.executable, "-m", "benchmarks.ros_ends", what, str(PORT)]
-            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-            running.append(subprocess.Popen(command, text=True, **pipes))
-            assert running[-1].stdout is not None
-            running[-1].stdout.readline()
+            pipe = subprocess.PIPE
+            process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+            running.append(process)
+            assert process.stdout is not None
+            process.stdout.readline()
         yield running[-1]
     finally:
         for process in running:

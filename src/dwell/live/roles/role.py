@@ -506,7 +506,8 @@ class Pulse:
         keys = (0, 0) if keyring is None else (keyring.own.generation, keyring.roster.number)
         return Beat(
             *(place.who, place.node, place.life, now_ns, ready, heard, term, placement),
-            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys, alone, rates),
+            *(self._digest, printable(note)[:2000], __version__, run, moving, *keys, alone),
+            rates=rates,
         )
 
     def _put(self, beat: Beat, *, alone: bool = True) -> None:
