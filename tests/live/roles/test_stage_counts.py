@@ -28,7 +28,7 @@ from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from tests.live.memory_transport import NetworkConditions
 from tests.live.seeded_faults import ENDS, unbalanced
-from tests.live.small_world import EXEC_MS, MS, Bench, Passing, World, canonical, on
+from tests.live.small_world import EXEC_MS, MS, Bench, Passing, World, canonical, on, queued
 
 #: Time in which a block of a second and what was told of it are complete.
 COUNTED_MS = 5_000
