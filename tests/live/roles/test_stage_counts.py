@@ -28,7 +28,7 @@ from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 from tests.live.memory_transport import NetworkConditions
 from tests.live.seeded_faults import ENDS, unbalanced
-from tests.live.small_world import EXEC_MS, MS, Bench, Passing, World, canonical, on
+from tests.live.small_world import EXEC_MS, MS, Bench, Passing, World, canonical, on, queued
 
 #: Time in which a block of a second and what was told of it are complete.
 COUNTED_MS = 5_000
@@ -121,9 +121,9 @@ def test_messages_that_come_twice_or_late_are_counted_once(
 
 
 def test_a_killed_worker_loses_what_waited_for_it(problem: Problem) -> None:
-    queued = dict(problem.pipeline.tasks)
-    queued["perception"] = replace(queued["perception"], depth=5)
-    cell = replace(problem, pipeline=replace(problem.pipeline, tasks=queued))
+    tasks = dict(problem.pipeline.tasks)
+    tasks["perception"] = replace(tasks["perception"], depth=5)
+    cell = replace(problem, pipeline=replace(problem.pipeline, tasks=tasks))
     world = World(cell, policy="SO", exec_ms={**EXEC_MS, "perception": 90.0})
     for _ in looks(world, COUNTED_MS / 1e3):
         pass
