@@ -30,7 +30,7 @@ GROUPS = {
     "Simulate": ("new", "check", "run", "study", "demo"),
     "See": ("report", "dash"),
     "Fleet": ("fleet",),
-    "Live": ("live", "keys", "doctor"),
+    "Live": ("live", "ros2", "keys", "doctor"),
     "Measure": ("profile", "testbed", "validate"),
 }
 EXAMPLES = """\
