@@ -70,4 +70,4 @@ def test_a_campaign_is_measured_and_reported(tmp_path: Path) -> None:
         pytest.skip("the machine was the bottleneck in every run")
     measured = read_measured(folder)
     assert measured.kinds == {"live"}
-    assert "What messages took" in campaign_html(measured, static=True)
+    assert "Delays of messages" in campaign_html(measured, static=True)
