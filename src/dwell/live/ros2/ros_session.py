@@ -94,7 +94,8 @@ def is_encrypted(settings: RosTopic) -> bool:
 class RosSession:
     """A Zenoh session with one node and one endpoint, opened and watched by a thread.
 
-    `open` returns at once; without a router the thread tries again.
+    `prepare` must succeed before `open`, which returns at once; without a router the thread tries
+    again.
     `receive` gets each message of a subscription, in Zenoh's thread.
     """
 
@@ -142,8 +143,7 @@ class RosSession:
         self.domain = domain_of(settings)
 
     def open(self) -> None:
-        """Prepare, and let a thread open the session."""
-        self.prepare()
+        """Let a thread open the session; `prepare` comes first."""
         start_thread("ros2", self._run)
 
     def close(self) -> None:

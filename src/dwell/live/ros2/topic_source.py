@@ -80,6 +80,7 @@ class Source(CellStage):
     def start(self) -> None:
         """Open the session; without a router it is tried again."""
         self._session = RosSession(self.settings, SUBSCRIPTION, self._place, self._arrived)
+        self._session.prepare()
         self._session.open()
         self._stamped = self._session.types.is_stamped(self.settings.type)
         self._began_ns = time.monotonic_ns()
