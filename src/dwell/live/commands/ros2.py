@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dwell.cli.options import Insecure, Keys, argument, flag, option
+from dwell.cli.options import CellArgument, Insecure, Keys, flag, option
 
 #: Seconds between two messages.
 EVERY_S = 1.0
@@ -23,11 +22,11 @@ def _group() -> None:
 
 @ros2.command()
 def diagnostics(
-    cell: Annotated[Path, argument("CELL", "Cell file.")],
+    cell: CellArgument,
     connect: Annotated[
-        str | None, option("ENDPOINT", "Zenoh router; by default tcp/localhost:7447.")
+        str | None, option("ENDPOINT", "Zenoh router.", default="tcp/localhost:7447")
     ] = None,
-    domain: Annotated[int | None, option("N", "Domain; by default ROS_DOMAIN_ID, or 0.")] = None,
+    domain: Annotated[int | None, option("N", "ROS domain.", default="ROS_DOMAIN_ID, or 0")] = None,
     once: Annotated[bool, flag("--once", "Publish one message, and end.")] = False,
     keys: Keys = None,
     insecure: Insecure = False,
