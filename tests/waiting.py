@@ -9,9 +9,11 @@ from collections.abc import Callable
 PATIENCE_S = 120.0
 
 
-def wait_until(holds: Callable[[], bool]) -> None:
+def wait_until(
+    holds: Callable[[], object], what: str = "it", *, patience_s: float = PATIENCE_S
+) -> None:
     """Look until something holds."""
-    deadline = time.monotonic() + PATIENCE_S
+    deadline = time.monotonic() + patience_s
     while not holds():
-        assert time.monotonic() < deadline, "it has not come true"
+        assert time.monotonic() < deadline, f"{what} has not come true within {patience_s:g} s"
         time.sleep(0.002)

@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Browser
 
+from tests.dash.browser import chromium
 from tests.dash.recorded import small_fleet, small_run
 from tests.dash.served import Served, serving
 
@@ -32,3 +34,10 @@ def page(run_folder: Path) -> Iterator[Served]:
     """Return a page of that run."""
     with serving(run_folder.parent, run_folder) as served:
         yield served
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """Return a browser without a page."""
+    with chromium() as made:
+        yield made

@@ -15,7 +15,7 @@ from dwell.record import FleetRun, open_fleet
 from dwell.record.fleet_run import LOAD, UNFINISHED
 from dwell.record.run import FLEET
 from tests.dash.browser import READY as CELL_READY
-from tests.dash.browser import chromium, in_browser, opened, settled, wait_for
+from tests.dash.browser import in_browser, opened, settled, wait_for
 from tests.dash.served import Served, serving
 from tests.dash.test_serving import LIVE, ran
 
@@ -34,12 +34,6 @@ def served(fleet_folder: Path) -> Iterator[Served]:
 @pytest.fixture(scope="module")
 def runs(fleet_folder: Path) -> FleetRun:
     return open_fleet(fleet_folder)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as made:
-        yield made
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 import dwell
-from tests.dash.browser import chromium, in_browser, opened, settled, wait_for
+from tests.dash.browser import in_browser, opened, settled, wait_for
 from tests.dash.recorded import small_run
 from tests.dash.served import Served, serving
 
@@ -21,12 +21,6 @@ pytestmark = in_browser
 #: Ends of the scales of latency, J and load, by cell.
 SCALES = """window.page.cells.map((cell) => cell.charts.scales())"""
 MARKUP = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>"
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as made:
-        yield made
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from playwright.sync_api import Browser, Page
 from dwell.dash.recorded_cell import RecordedCell
 from dwell.dash.runs_folder import MOST_RUNS, RunsFolder
 from dwell.errors import RunError
-from tests.dash.browser import chromium, in_browser, opened, settled, wait_for
+from tests.dash.browser import in_browser, opened, settled, wait_for
 from tests.dash.recorded import WrittenRun, small_run
 from tests.dash.served import Served, serving, until
 
@@ -116,12 +116,6 @@ def served(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ser
 @pytest.mark.parametrize("cells", ["", "x", "6", "-1", "0,9", "0,,1"])
 def test_lines_of_other_runs_are_refused(served: Served, cells: str) -> None:
     assert served.ask(f"/lines?cells={cells}", served.bearer).status == 400
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as made:
-        yield made
 
 
 @pytest.fixture

@@ -6,26 +6,19 @@ import json
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tests.ports import free_ports
+from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
-#: Longest time for anything to happen on a busy machine.
-PATIENCE_S = 60.0
-
-
-def until(condition: Callable[[], object], what: str) -> None:
-    """Wait until a condition holds."""
-    end_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end_s, f"not within {PATIENCE_S:g} s: {what}"
-        time.sleep(0.01)
+#: Waits until a condition holds, on a busy machine too.
+until = partial(wait_until, patience_s=60.0)
 
 
 @dataclass
