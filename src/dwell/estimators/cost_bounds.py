@@ -11,6 +11,7 @@ that its latency implies.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -78,6 +79,8 @@ class CostBounds:
             hop: row + min(self._transmission_ns(hop), most_ns) for hop, row in delay_ns
         }
         self._span_ns = int((close_ns - real.release_ns[: -1 : self._width]).max())
+        self._never_dropped = self._undropped()
+        self._means_ns = {site: self._mean_work(*site) for site in real.sites}
         self._tail_ns = self._tails()
         self._costs = self._work_costs()
         self._left = self._costs_left()
@@ -130,20 +133,29 @@ class CostBounds:
         return float(latency) / targets.latency_ms + work
 
     def overloaded(self, partial: Partial) -> str | None:
-        """Return a resource with more work than it can do, if its queues lose no job."""
-        tasks = self._problem.pipeline.tasks
-        resources = self._problem.fabric.resources
+        """Return a resource with more work than it can do if no message is lost.
+
+        Work that full queues may drop does not count.
+        """
         period_ns = self._problem.pipeline.period_ms * 1e6
-        for name, load in partial.loads.items():
-            placed = [
-                task
-                for task, node in partial.nodes.items()
-                if tasks[task].on[node].resource(node) == name
-            ]
-            loses = any(tasks[task].depth for task in placed)
-            if not loses and load.work_ns.mean() > resources[name].capacity * period_ns:
-                return name
+        work_ns: defaultdict[str, float] = defaultdict(float)
+        for name, node in partial.nodes.items():
+            if name in self._never_dropped:
+                resource, mean_ns = self._means_ns[name, node]
+                work_ns[resource.name] += mean_ns
+                if work_ns[resource.name] > resource.capacity * period_ns:
+                    return resource.name
         return None
+
+    def _undropped(self) -> frozenset[str]:
+        """Return the tasks whose jobs no full queue drops, theirs or one before them."""
+        pipeline = self._problem.pipeline
+        found: set[str] = set()
+        for name in self.order:
+            before = (flow.source in found for flow in pipeline.inputs(name))
+            if pipeline.tasks[name].depth == 0 and all(before):
+                found.add(name)
+        return frozenset(found)
 
     def _transmission_ns(self, hop: tuple[str, str, str]) -> int:
         """Return the least time that a message takes at the rate of a link."""
@@ -160,6 +172,10 @@ class CostBounds:
         resource = self._problem.fabric.resources[execution.resource(node)]
         threads = execution.threads if execution.accelerator is None else 1
         return resource, self._exec_ns[name, node] * threads
+
+    def _mean_work(self, name: str, node: str) -> tuple[Resource, float]:
+        resource, work_ns = self._work(name, node)
+        return resource, float(work_ns.mean())
 
     def _tails(self) -> dict[tuple[str, str], Ints]:
         """Return the least time from a task's end to the cycle's, by task and node."""
