@@ -140,7 +140,8 @@ class FleetPrices:
         self._absent: frozenset[int] = frozenset()
         self._real = list(self._declared)
         self._alone: list[dict[str, CellPrice]] = [{} for _ in self.cells]
-        self._known: dict[Placements, FleetPrice] = {}
+        #: Prices under the present conditions, by placements.
+        self.known: dict[Placements, FleetPrice] = {}
         self._first: Arrays | None = None
 
     def __repr__(self) -> str:
@@ -166,7 +167,7 @@ class FleetPrices:
             cell, declared = self.cells[i], self._declared[i]
             self._real[i] = realised(cell.problem, declared, self._of(i))
             self._alone[i].clear()
-        self._known.clear()
+        self.known.clear()
         self._first = None
 
     def _of(self, index: int) -> Present:
@@ -185,16 +186,11 @@ class FleetPrices:
                     down.add(name)
         return replace(present, threads=FrozenDict(threads), down=frozenset(down))
 
-    def knows(self, placements: Placements) -> bool:
-        """Whether the price at some placements is known under these measured conditions."""
-        return placements in self._known
-
     def price(self, placements: Placements) -> FleetPrice:
         """Return the price at some placements; simulate it once per measured conditions."""
-        known = self._known.get(placements)
-        if known is None:
-            known = self._known[placements] = self._price(placements)
-        return known
+        if placements not in self.known:
+            self.known[placements] = self._price(placements)
+        return self.known[placements]
 
     def _price(self, placements: Placements) -> FleetPrice:
         placed = {i: name for i, name in enumerate(placements) if name is not None}
