@@ -299,12 +299,12 @@ def test_a_scenario_has_prices_of_its_own() -> None:
 def test_prices_are_handed_over_and_few_are_kept() -> None:
     problem = chain(0.7)
     first = prices_of(problem)
-    handed = prices.known_prices()
+    handed = prices.KNOWN_PRICES.known
     for seed in range(prices.KEPT):
         prices_of(problem, seed=seed, cycles=1)
-    assert len(prices.known_prices()) == prices.KEPT
+    assert len(prices.KNOWN_PRICES.known) == prices.KEPT
     again = prices_of(problem)
     assert again is not first
     assert again == first
-    prices.take_over(handed)
+    prices.KNOWN_PRICES.add(handed)
     assert prices_of(problem) is first

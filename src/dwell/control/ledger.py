@@ -47,13 +47,8 @@ from dwell.control.watchdog import (
     Watchdog,
 )
 from dwell.cost import exceeds, excess, hamming
-from dwell.estimators.fleet_prices import (
-    CellPrice,
-    CellTerms,
-    FleetPrice,
-    FleetPrices,
-    PricedCell,
-)
+from dwell.estimators.cell_terms import CellTerms
+from dwell.estimators.fleet_prices import CellPrice, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
 from dwell.estimators.present import Present
 from dwell.estimators.prices import prices_of

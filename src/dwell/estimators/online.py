@@ -13,11 +13,10 @@ import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from functools import partial
-from typing import NamedTuple
 
 from dwell.cost import cost_error, hamming
+from dwell.estimators.cell_terms import CellTerms
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.fleet_prices import CellTerms
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
@@ -39,14 +38,6 @@ FIRST_STEPS = 6
 ROUNDS, STEPS = 2, 2
 #: A decision is sure if a price difference is this many standard errors from its thresholds.
 BAND = 2.0
-
-
-class _Declared(NamedTuple):
-    """Work and metrics of a candidate under declared conditions, in the form of `unchecked_qos`."""
-
-    work: list[tuple[str, float]]
-    latency: tuple[float, float]
-    others: tuple[float | None, tuple[float, float] | None]
 
 
 class Online(CellEstimator):
@@ -79,8 +70,8 @@ class Online(CellEstimator):
         self._plays = False
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
-        #: Constant parts of the estimates, cached at the first estimate.
-        self._declared: dict[str, _Declared] = {}
+        #: Price and work of each candidate as declared, cached at the first estimate.
+        self._declared: dict[str, tuple[QoS, list[tuple[str, float]]]] = {}
         #: The last window until `estimate` uses it, and until its demands are learnt.
         self._evidence: Evidence | None = None
         self._pending: Evidence | None = None
@@ -203,31 +194,23 @@ class Online(CellEstimator):
         return self._player.deviations(name)
 
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
-        """Return the metrics of all candidates, without errors if simulated."""
-        played = {name: self._player.played(name) for name in names}
+        """Return the metrics of all candidates; some of them are simulated."""
         if not self._declared:
-            self._declared = {name: self._as_declared(name) for name in self.problem.candidates}
-        work = [
-            (name, self._with_sent(name, played[name].utilisation) if name in played else one.work)
-            for name, one in self._declared.items()
-        ]
-        shares = self.profile.with_work(foreign, work)
-        estimates = {}
-        for name, one in self._declared.items():
-            if name not in played:
-                estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
-                continue
-            qos = played[name]
-            estimates[name] = unchecked_qos(
-                qos.l95_ms, qos.violation_rate, shares[name], qos.cut_from_ms
+            self._declared = {
+                name: (price.qos, self._with_sent(name, price.own))
+                for name, price in self._player.prices.items()
+            }
+        priced = dict(self._declared)
+        for name in names:
+            qos = self._player.played(name)
+            priced[name] = qos, self._with_sent(name, qos.utilisation)
+        shares = self.profile.with_work(foreign, ((name, priced[name][1]) for name in priced))
+        return {
+            name: unchecked_qos(
+                qos.l95_ms, qos.violation_rate, shares[name], qos.cut_from_ms, qos.error
             )
-        return estimates
-
-    def _as_declared(self, name: str) -> _Declared:
-        """Return the constant parts of a candidate's estimate under declared conditions."""
-        qos, work = self._player.prices[name].qos, self._player.prices[name].own
-        latency, others = (qos.l95_ms, qos.violation_rate), (qos.cut_from_ms, qos.error)
-        return _Declared(self._with_sent(name, work), latency, others)
+            for name, (qos, _) in priced.items()
+        }
 
     def _with_sent(self, name: str, work: Mapping[str, float]) -> list[tuple[str, float]]:
         """Add the share of each resource that shadow jobs take to the cell's own work."""

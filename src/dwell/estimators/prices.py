@@ -165,7 +165,8 @@ class Question:
         )
 
 
-_remembered = Remembered[Question, Mapping[str, Price]](KEPT)
+#: Known prices of this process; another process can take them over.
+KNOWN_PRICES = Remembered[Question, Mapping[str, Price]](KEPT)
 
 
 def prices_of(
@@ -183,17 +184,7 @@ def prices_of(
     this share by candidate. Raise `KernelError` if the compiled kernel cannot be loaded.
     """
     question = Question.of(problem, scenario, seed, cycles, shadow_fraction)
-    return _remembered.answer(question, lambda: _answer(question))
-
-
-def known_prices() -> dict[Question, Mapping[str, Price]]:
-    """Return the known prices of this process, which another process can `take_over`."""
-    return dict(_remembered.known)
-
-
-def take_over(known: Mapping[Question, Mapping[str, Price]]) -> None:
-    """Add known prices; drop the oldest beyond `KEPT`."""
-    _remembered.add(known)
+    return KNOWN_PRICES.answer(question, lambda: _answer(question))
 
 
 def _answer(question: Question) -> Mapping[str, Price]:

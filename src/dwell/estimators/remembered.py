@@ -14,14 +14,19 @@ class Remembered(Generic[Asked, Answer]):
 
     def __init__(self, most: int) -> None:
         self._most = most
-        self.known: dict[Asked, Answer] = {}
+        self._known: dict[Asked, Answer] = {}
 
     def __repr__(self) -> str:
-        return f"<Remembered: {len(self.known)} of at most {self._most} answers>"
+        return f"<Remembered: {len(self._known)} of at most {self._most} answers>"
+
+    @property
+    def known(self) -> dict[Asked, Answer]:
+        """The known answers, the oldest first."""
+        return dict(self._known)
 
     def answer(self, question: Asked, find: Callable[[], Answer]) -> Answer:
         """Return the known answer to a question, else find and keep it."""
-        known = self.known.get(question)
+        known = self._known.get(question)
         if known is None:
             known = find()
             self.add({question: known})
@@ -29,6 +34,6 @@ class Remembered(Generic[Asked, Answer]):
 
     def add(self, known: Mapping[Asked, Answer]) -> None:
         """Add answers, and drop the oldest beyond `most`."""
-        self.known.update(known)
-        for question in list(self.known)[: -self._most]:
-            del self.known[question]
+        self._known.update(known)
+        for question in list(self._known)[: -self._most]:
+            del self._known[question]

@@ -18,7 +18,8 @@ from dwell.control.fleet_rank import FleetRank, fleet_rank
 from dwell.control.knapsack import cheapest
 from dwell.control.neighbours import Neighbours, Rank
 from dwell.control.table_loads import Loads
-from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices
+from dwell.estimators.cell_terms import CellTerms
+from dwell.estimators.fleet_prices import FleetPrice, FleetPrices
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import SEED, prices_of
 from dwell.model.fleet import Fleet
