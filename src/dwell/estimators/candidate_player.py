@@ -10,8 +10,6 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from dwell.estimators.present import MOST_THREADS, Present, in_order
 from dwell.estimators.present_tables import PresentTables
 from dwell.estimators.sent_shadows import SentShadows
@@ -119,17 +117,10 @@ class CandidatePlayer:
 
     def tables(self, placed: Mapping[int, str]) -> Arrays:
         """Return tables in which some cells run candidates; the others are left out."""
-        arrays = self.first.copy()
-        stamps = np.zeros_like(arrays.tables.stamps)
-        for index, name in placed.items():
-            row, number = arrays.parts[index].row, self._numbers[index][name]
-            stamps[row] = number
-            if self.shadows is not None:
-                stamps[row + 1] = self.shadows.stamps(number)
-        arrays.replace(stamps=stamps)
-        if len(placed) < len(self.cells):
-            arrays.leave_out(set(range(len(self.cells))).difference(placed))
-        return arrays
+        numbers = {i: self._numbers[i][name] for i, name in placed.items()}
+        if self.shadows is not None:
+            return self.first.on({**numbers, 1: self.shadows.stamps(numbers[0])})
+        return self.first.on(numbers)
 
     def play(self, placed: Mapping[int, str]) -> Arrays:
         """Return the tables after the last event of these cells on these candidates."""
