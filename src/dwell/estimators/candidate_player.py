@@ -1,7 +1,7 @@
-"""Candidate player: plays candidates of cells on common samples, with the kernel.
+"""Candidate player: simulates candidates of one or several cells on common samples.
 
 All candidates of a cell have the same realisation, so only the places of their tasks differ. Cells
-that share nodes are played together. Each cell may have measured conditions.
+that share nodes are simulated together. Each cell may have measured conditions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from dwell.model.problem import Problem
 
 
 class PlayedWindows(NamedTuple):
-    """Windows of a cell that stays on a candidate, one value per window."""
+    """Simulated windows of a cell that stays on a candidate."""
 
     l95_ms: Floats
     #: Number of cycles that missed the deadline.
@@ -44,7 +44,7 @@ class PlayedWindows(NamedTuple):
 
 
 class CandidatePlayer:
-    """Plays candidates of one or several cells, always on the same samples.
+    """Simulates candidates of cells, always on the same samples.
 
     Each node in `shared` is one computer for all cells. `shadows` are the shadow jobs of a single
     cell. If `measures`, the cells may get measured conditions (see `begin`). `log_jobs` and
@@ -61,8 +61,9 @@ class CandidatePlayer:
         log_jobs: bool = False,
         decides: bool = False,
     ) -> None:
-        self.cells, self.shadows, self.measures = tuple(cells), shadows, measures
-        self._shared, self._options = shared, {"log_jobs": log_jobs, "decides": decides}
+        self.cells, self.measures = tuple(cells), measures
+        self._shared, self._shadows = shared, shadows
+        self._options = {"log_jobs": log_jobs, "decides": decides}
         self._numbers = [{name: i for i, name in enumerate(of.candidates)} for of, _ in cells]
         self._presents: list[PresentTables] = []
         self._first: Arrays | None = None
@@ -78,9 +79,9 @@ class CandidatePlayer:
         return self._first
 
     def _laid_out(self) -> Arrays:
-        sent = [self.shadows.realisation] if self.shadows is not None else []
+        sent = [self._shadows.realisation] if self._shadows is not None else []
         problems = [problem for problem, _ in self.cells]
-        #: The realisation of each cell, then of its shadows.
+        # The realisation of each cell, then of its shadows.
         declared = [[real, *sent] for _, real in self.cells]
         played = declared
         if self.measures:
@@ -101,9 +102,9 @@ class CandidatePlayer:
         return first
 
     def begin(self, presents: Mapping[int, Present]) -> Arrays:
-        """Begin with other measured conditions of some cells, and return the first tables.
+        """Set the measured conditions of some cells, and return the first tables.
 
-        A shared node has the conditions of the first cell.
+        The first cell sets the conditions of shared nodes.
         """
         first = self.first
         for index, present in presents.items():
@@ -111,19 +112,19 @@ class CandidatePlayer:
         first.replace(changes=in_order([tables.changes for tables in self._presents]))
         return first
 
-    def grow(self, present: Present, since: int, offset: int = 0) -> None:
+    def grow(self, present: Present, since: int, offset: int) -> None:
         """Use newer values of a single cell from a cycle on (see `PresentTables.grow`)."""
         self._presents[0].grow(present, since, offset)
 
     def tables(self, placed: Mapping[int, str]) -> Arrays:
-        """Return tables in which some cells run candidates; the others are left out."""
+        """Return first tables in which some cells run candidates, without the other cells."""
         numbers = {i: self._numbers[i][name] for i, name in placed.items()}
-        if self.shadows is not None:
-            return self.first.on({**numbers, 1: self.shadows.stamps(numbers[0])})
+        if self._shadows is not None:
+            return self.first.on({**numbers, 1: self._shadows.stamps(numbers[0])})
         return self.first.on(numbers)
 
     def play(self, placed: Mapping[int, str]) -> Arrays:
-        """Return the tables after the last event of these cells on these candidates."""
+        """Simulate some cells on candidates, and return the tables at the end."""
         arrays = self.tables(placed)
         play(arrays)
         return arrays
@@ -131,7 +132,7 @@ class CandidatePlayer:
     def windows(
         self, arrays: Arrays, index: int = 0, first: int = 0, last: int | None = None
     ) -> PlayedWindows:
-        """Return the windows of a cell from `first` to before `last`."""
+        """Return some windows of a cell, from `first` until before `last`."""
         part, tables, stretch = arrays.parts[index], arrays.tables, slice(first, last)
         seen = tables.seen[part.row, stretch]
         shares = tables.shares[part.row, stretch, :, : part.resources]
@@ -140,7 +141,7 @@ class CandidatePlayer:
 
 
 def _to_measure(problem: Problem, real: Realisation) -> Realisation:
-    """Return a realisation with its own demands, and a change of every node at 0 to replace."""
+    """Return a realisation whose demands and changes of nodes can be replaced."""
     begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
     # Nodes with a quota in ticks need room for the most threads; this change never happens.
     ends = [

@@ -1,4 +1,4 @@
-"""Cell terms: J of a cell in its own terms and the terms of nodes that cells share."""
+"""Cell terms: J of a cell without the nodes that cells share, and the cost of these nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Declared cell: the undisturbed cell, to which measured conditions are compared."""
+"""Declared cell: the undisturbed cell, with which windows are compared."""
 
 from __future__ import annotations
 

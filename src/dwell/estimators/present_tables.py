@@ -1,4 +1,4 @@
-"""Present tables: a cell in the kernel's tables, under its measured conditions."""
+"""Present tables: the measured conditions of a cell in the kernel's tables."""
 
 from __future__ import annotations
 
@@ -20,11 +20,10 @@ BEYOND = 64
 
 
 class PresentTables:
-    """Writes measured conditions of a cell into tables, and restores the declared values.
+    """Writes the measured conditions of a cell into tables.
 
-    `drawn` has the declared realisation of the cell and its copy in the tables, then those of its
-    shadows. `changes` are the changes of the cell's nodes; the changes of shared nodes belong to
-    the first cell.
+    `drawn` has a declared realisation and its copy in the tables, for the cell and for its shadows.
+    `changes` are the changes of the cell's nodes. The first cell has the changes of shared nodes.
     """
 
     def __init__(
@@ -72,7 +71,7 @@ class PresentTables:
         self._filled: Mapping[Part, Floats] = {}
 
     def begin(self, present: Present) -> None:
-        """Write measured conditions in place of earlier ones."""
+        """Restore the declared values, and write measured conditions."""
         for table, declared in self._declared:
             np.copyto(table, declared)
         self.changes = present.changes(self._declared_changes, self._nodes, self._release_ns)
@@ -87,7 +86,7 @@ class PresentTables:
         self.fill(present)
 
     def grow(self, present: Present, since: int, offset: int) -> None:
-        """Write newer values of the same parts for the cycles from `since` on (see `fill`)."""
+        """Write newer values of the same parts (see `fill`)."""
         self._set_losses(present)
         self.fill(present, since, offset)
 

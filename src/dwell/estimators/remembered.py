@@ -1,4 +1,4 @@
-"""Remembered: answers that are kept by the content of their questions."""
+"""Remembered: a cache of answers, by the content of their questions."""
 
 from __future__ import annotations
 

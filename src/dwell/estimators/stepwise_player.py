@@ -1,7 +1,7 @@
-"""Stepwise player: candidates of a cell under measured conditions, played step by step.
+"""Stepwise player: simulates candidates of a cell under measured conditions, step by step.
 
-All candidates are played on the same realisation. Each one continues where it stopped, and its
-newest steps are averaged until the conditions change.
+All candidates have the same realisation. Each simulation continues where it stopped, and its newest
+steps are averaged until the conditions change.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class _Twin:
 
 
 class StepwisePlayer:
-    """Simulation of the candidates of a problem under measured conditions.
+    """Simulates the candidates of a problem under measured conditions.
 
     `seed` is the seed of the declared realisation; `shadow_fraction` is the share of cycles that
     are also sent through each alternative, by simulated candidate. `prices` are the prices as
