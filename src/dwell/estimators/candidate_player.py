@@ -17,6 +17,7 @@ from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.realisation import NodeChange, NodeChanges, Realisation
+from dwell.kernels.rows import Rows
 from dwell.model.bounds import counted
 from dwell.model.fabric import Node
 from dwell.model.number_arrays import Floats, Ints
@@ -26,21 +27,32 @@ from dwell.model.problem import Problem
 class PlayedWindows(NamedTuple):
     """Simulated windows of a cell that stays on a candidate."""
 
-    l95_ms: Floats
-    #: Number of cycles that missed the deadline.
-    missed: Ints
-    #: L95 without the bound ``problem.censor_ms``.
-    uncut_ms: Floats
+    #: Rows of the table ``seen``.
+    seen: Rows
     #: Shares of each resource, shape (windows, `PARTS`, resources).
     shares: Floats
     #: W.
-    window_cycles: int
+    cycles: int
+
+    @property
+    def l95_ms(self) -> Floats:
+        """L95 as a controller measures it."""
+        return self.seen["l95_ms"]
+
+    @property
+    def uncut_ms(self) -> Floats:
+        """L95 without the bound ``problem.censor_ms``."""
+        return self.seen["uncut_ms"]
+
+    @property
+    def missed(self) -> Ints:
+        """Number of cycles that missed the deadline."""
+        return self.seen["missed"]
 
     @property
     def violation_rate(self) -> Floats:
         """V_D."""
-        rates: Floats = self.missed / self.window_cycles
-        return rates
+        return self.missed / self.cycles
 
 
 class CandidatePlayer:
@@ -134,10 +146,9 @@ class CandidatePlayer:
     ) -> PlayedWindows:
         """Return some windows of a cell, from `first` until before `last`."""
         part, tables, stretch = arrays.parts[index], arrays.tables, slice(first, last)
-        seen = tables.seen[part.row, stretch]
         shares = tables.shares[part.row, stretch, :, : part.resources]
-        width = self.cells[index][0].window_cycles
-        return PlayedWindows(seen["l95_ms"], seen["missed"], seen["uncut_ms"], shares, width)
+        cycles = self.cells[index][0].window_cycles
+        return PlayedWindows(tables.seen[part.row, stretch], shares, cycles)
 
 
 def _to_measure(problem: Problem, real: Realisation) -> Realisation:
