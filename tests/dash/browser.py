@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.dash.served import until
+from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 #: True once a cell's page is drawn.
@@ -29,7 +29,7 @@ def chromium() -> Iterator[Browser]:
 
 def wait_for(page: Page, expression: str) -> None:
     """Wait until an expression is true; Playwright's own way needs `unsafe-eval`."""
-    until(lambda: page.evaluate(f"Boolean({expression})"))
+    wait_until(lambda: page.evaluate(f"Boolean({expression})"))
 
 
 #: Counts the requests of a page that have no answer yet.
