@@ -102,7 +102,8 @@ def real_cell(folder: Path, network: RosNetwork) -> Iterator[RealCell]:
     camera["connect"] = actuators["control"]["ros2"]["connect"] = network.router
     actuators["control"]["ros2"]["type"] = TWIST
     document["live"] |= {"actuators": actuators, "silence": "zero"}
-    cell.module.with_name("ros_stages.py").write_text(STAMPED)
+    document["tasks"]["control"]["run"] = "stamped:Steer"
+    cell.module.with_name("stamped.py").write_text(STAMPED)
     cell.file.write_text(yaml.safe_dump(document, sort_keys=False))
     cell.problem = dwell.load(cell.file)
     try:
@@ -114,23 +115,15 @@ def real_cell(folder: Path, network: RosNetwork) -> Iterator[RealCell]:
 #: The example's last stage for a base that takes stamped commands.
 STAMPED = """
 import msgspec
-from stages import Turn
+import ros_stages
 from dwell.live.stage import Message
 
-class Vector(msgspec.Struct):
-    z: float
-
-class Twist(msgspec.Struct):
-    angular: Vector
-
 class Stamped(msgspec.Struct):
-    twist: Twist
+    twist: ros_stages.Twist
 
-class Steer:
-    inputs = {"planning": Turn}
-
+class Steer(ros_stages.Steer):
     def process(self, inputs):
-        return Message(Stamped(Twist(Vector(-inputs["planning"].payload.rate))))
+        return Message(Stamped(super().process(inputs).payload))
 """
 
 
