@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from urllib.parse import urlsplit
@@ -57,6 +58,24 @@ SETTLED = """async () => {
 def settled(shown: Page) -> None:
     """Wait until what was asked for is drawn."""
     shown.evaluate(SETTLED)
+
+
+def played(shown: Page, for_ms: int = 300) -> float:
+    """Play at speed 5 for a time of the page's clock, and pause; return the place.
+
+    The clock only runs here, so that the page does not reach its end before the click on Pause.
+    """
+    shown.clock.install()
+    shown.clock.pause_at(time.time() + 60)
+    shown.get_by_role("combobox").select_option("5")
+    begin = shown.evaluate("window.page.at")
+    shown.get_by_role("button", name="Play", exact=True).click()
+    shown.clock.run_for(for_ms)
+    shown.get_by_role("button", name="Pause").click()
+    place: float = shown.evaluate("window.page.at")
+    assert begin < place <= begin + 5e-3 * for_ms
+    shown.clock.resume()
+    return place
 
 
 @contextmanager
