@@ -202,7 +202,9 @@ def autoware_graph(nodes: int) -> Problem:
     cores = {"R1": 2, "R2": 2, "E": 2, "C": 8}
     tier = {"R1": "robot", "R2": "robot", "E": "edge", "C": "cloud"}
     delay_ms = {"R1": 0.5, "R2": 0.5, "E": 1.5, "C": 8.0}
-    tasks = {name: {"on": {node: {"exec_ms": 0.2}}} for name, node in SOURCES.items()}
+    tasks: dict[str, Any] = {
+        name: {"on": {node: {"exec_ms": 0.2}}} for name, node in SOURCES.items()
+    }
     tasks |= {
         name: {
             "on": {
