@@ -156,6 +156,7 @@ WINDOWS = (
         null=UNMEASURED,
     ),
     Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),
+    Column("overtaken", "Int64", "Its cycles that completed after a later cycle had."),
     Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
     Column("shadow_bytes", "Int64", "Bytes of shadows on links.", "bytes", of=SHADOWS),
     Column(

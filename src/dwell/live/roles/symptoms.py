@@ -36,7 +36,8 @@ class Symptoms:
 
     def __init__(self, problem: Problem, ledger: Ledger) -> None:
         self._ledger, self._size = ledger, problem.window_cycles
-        self._guard_cycles = problem.controller.guard_cycles
+        # Cycles that may still complete within the guard's patience.
+        self._open = problem.controller.guard_cycles + problem.pipeline.open_cycles - 1
         self._failures = problem.controller.failures_in_a_row
         self._deadline_ns = problem.pipeline.deadline_ns
         self._period_ns = problem.pipeline.period_ns
@@ -170,11 +171,11 @@ class Symptoms:
         return max(counts, key=counts.__getitem__, default=None)
 
     def _failing(self, newest: Sequence[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield candidates whose last shadows all failed; the g newest cycles do not count."""
+        """Yield candidates whose last shadows all failed, except within the guard's patience."""
         most = self._failures
         fails: dict[str, list[LiveCycle]] = {}
         succeeded = set()
-        for place, cycle in enumerate(newest[self._guard_cycles :]):
+        for place, cycle in enumerate(newest[self._open :]):
             if not cycle.shadow or cycle.shadow in succeeded:
                 continue
             known = fails.get(cycle.shadow)
