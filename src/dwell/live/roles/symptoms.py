@@ -125,7 +125,9 @@ class Symptoms:
         return None if span_ns < window_ns else count * self._period_ns / span_ns
 
     def _is_applied(self, cycle: LiveCycle) -> bool:
-        return cycle.told or (cycle.actuated and self._ledger.complete(cycle))
+        """Whether its command was applied, or was in time and overtaken by a later command."""
+        in_time = cycle.overtaken and not cycle.missed(self._deadline_ns)
+        return cycle.told or ((cycle.actuated or in_time) and self._ledger.complete(cycle))
 
     def _commands(self) -> dict[str, list[Any]]:
         """Return silences, applied commands and cycles of the last windows and of their leads.
