@@ -81,6 +81,7 @@ tasks:
     warmup_jobs: 3
   listen:
     "on": {R: {exec_ms: 1}}
+    every: 3
     ros2:
       topic: audio
       type: audio_msgs/msg/Audio
@@ -96,7 +97,8 @@ tasks:
 flows:
   - {from: see, to: think, bytes: 100}
   - {from: see, to: look}
-  - {from: listen, to: think}
+  - {from: listen, to: look, sampled: true}
+  - {from: see, to: act, sampled: true}
   - {from: think, to: act}
   - {from: look, to: act}
 candidates: {LOC: {think: R}, FAR: {think: E}}

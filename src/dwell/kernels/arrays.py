@@ -272,6 +272,9 @@ def lay_out(
         Samples for the shadow jobs of each cell (see `draw_shadows`); None if a cell sends no
         shadows.
     """
+    for problem, _ in cells:
+        if problem.pipeline.has_rates:
+            raise SimulationError(f"{problem.name} has `every` or `sampled`: not simulated yet")
     return _Layout(cells, shared, log_jobs, log_windows, decides, shadows).arrays()
 
 

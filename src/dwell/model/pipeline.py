@@ -11,10 +11,12 @@ from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 from dwell.model.ros_topics import RosTopic
+from dwell.model.task_rates import rates_of
 
 #: Workers of a task on a node, and the task's default for each of its nodes.
 WORKERS = Bound(1, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
+EVERY = Bound(1, 10_000, whole=True)
 
 
 @declared()
@@ -76,7 +78,17 @@ class Task:
         default=None,
         tier="measured",
     )
-    offset_ms: float = key("Start of a source after the cycle's release, ms.", TIME_MS, default=0.0)
+    every: int | None = key(
+        "Cycles from one run to the next of a task without waited inputs.",
+        EVERY,
+        default=None,
+        usual="1, or the rate of its waited inputs",
+    )
+    offset_ms: float = key(
+        "Start after the cycle's release of a task without waited inputs, ms.",
+        TIME_MS,
+        default=0.0,
+    )
     start_ms: float = key(
         "Time that a new worker needs before its first job, ms.",
         TIME_MS,
@@ -136,6 +148,10 @@ class Flow:
         default=0,
         named="bytes",
         tier="first",
+    )
+    sampled: bool = key(
+        "Whether the target does not wait for it, but takes the newest message that has arrived.",
+        default=False,
     )
 
 
@@ -209,18 +225,73 @@ class Pipeline:
         """Flows into a task."""
         return tuple(flow for flow in self.flows if flow.target == task)
 
+    def waited(self, task: str) -> tuple[Flow, ...]:
+        """Flows into a task that it waits for: all except sampled flows."""
+        return tuple(flow for flow in self.inputs(task) if not flow.sampled)
+
     def outputs(self, task: str) -> tuple[Flow, ...]:
         """Flows out of a task."""
         return tuple(flow for flow in self.flows if flow.source == task)
+
+    @property
+    def sinks(self) -> tuple[str, ...]:
+        """Tasks without outputs."""
+        return tuple(name for name in self.tasks if not self.outputs(name))
+
+    @property
+    def rates(self) -> dict[str, int]:
+        """Cycles from one run of each task to its next."""
+        return rates_of(self.tasks, self.flows)
+
+    @property
+    def has_rates(self) -> bool:
+        """Whether some task does not run in each cycle, or some flow is sampled."""
+        every = (task.every or 1 for task in self.tasks.values())
+        return any(flow.sampled for flow in self.flows) or max(every) > 1
+
+    @property
+    def on_the_way(self) -> frozenset[str]:
+        """The sinks, and all tasks from which waited flows lead to a sink.
+
+        Only these tasks determine the latency and the outcome of a cycle.
+        """
+        found = {*self.sinks}
+        for name in reversed(self.topological()):
+            if any(not flow.sampled and flow.target in found for flow in self.outputs(name)):
+                found.add(name)
+        return frozenset(found)
+
+    @property
+    def sink_cycles(self) -> int:
+        """Cycles from one run to the next of the slowest sink."""
+        if not any(task.every for task in self.tasks.values()):
+            return 1
+        rates = self.rates
+        return max(rates[name] for name in self.sinks)
+
+    @property
+    def has_idle_cycles(self) -> bool:
+        """Whether no sink is due in some cycles."""
+        rates = self.rates
+        return min(rates[name] for name in self.sinks) > 1
+
+    def message_rate(self, flow: Flow) -> int:
+        """Cycles from one message of a flow to its next.
+
+        A waited flow has messages in the cycles in which its target runs, a sampled flow in the
+        cycles in which its source runs.
+        """
+        return self.rates[flow.source if flow.sampled else flow.target]
 
     def diverging(self, active: Mapping[str, str], other: Mapping[str, str]) -> frozenset[str]:
         """Return the tasks on another node under `other`, and all tasks downstream of them.
 
         A shadow through `other` runs these tasks and shares the rest with the cycle under `active`.
+        Sampled flows do not count.
         """
         found: set[str] = set()
         for name in self.topological():
-            behind = any(flow.source in found for flow in self.inputs(name))
+            behind = any(flow.source in found for flow in self.waited(name))
             if active[name] != other[name] or behind:
                 found.add(name)
         return frozenset(found)

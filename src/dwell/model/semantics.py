@@ -21,6 +21,7 @@ from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Tier
 from dwell.model.pipeline import Flow, Task
+from dwell.model.task_rates import rate_faults
 from dwell.model.scenario import (
     MAX_LAYERS,
     RAMP_LAYERS,
@@ -215,7 +216,7 @@ def _links(parts: CellParts) -> Iterator[Fault]:
 def _tasks(parts: CellParts) -> Iterator[Fault]:
     if not parts.tasks:
         yield Fault("tasks", "none is declared; a pipeline needs at least one task")
-    targets = {flow.target for _, flow in parts.flows}
+    targets = {flow.target for _, flow in parts.flows if not flow.sampled}
     for name, task in parts.tasks.items():
         if task is None:
             continue
@@ -225,7 +226,8 @@ def _tasks(parts: CellParts) -> Iterator[Fault]:
         if task.offset_ms and name in targets:
             yield Fault(
                 f"{path}.offset_ms",
-                f"{task.offset_ms:g} on a task with inputs; only a source has an offset: remove it",
+                f"{task.offset_ms:g} on a task that waits for inputs; only a task without waited inputs "
+                "has an offset: remove it",
             )
         for node_name, execution in task.on.items():
             yield from _unknown(f"{path}.on.{node_name}", "node", node_name, parts.nodes)
@@ -250,10 +252,26 @@ def _flows(parts: CellParts) -> Iterator[Fault]:
             again = f"flow {flow.source} -> {flow.target} is declared again"
             yield Fault(path, f"{again} (first at {seen[pair]}); keep one")
         seen.setdefault(pair, path)
-    loop = _cycle([flow for _, flow in parts.flows])
-    if loop:
-        walk = " -> ".join((*loop, loop[0]))
-        yield Fault("flows", f"the cycle {walk} never starts; remove one of these flows")
+    flows = [flow for _, flow in parts.flows]
+    loop = _cycle(flows)
+    if not loop:
+        yield from _rates(parts, flows)
+        return
+    walk = " -> ".join((*loop, loop[0]))
+    links = {*zip(loop, (*loop[1:], loop[0]), strict=True)}
+    if any(flow.sampled and (flow.source, flow.target) in links for flow in flows):
+        message = f"the loop {walk} has a sampled flow; loops are not supported, remove this flow"
+    else:
+        message = f"the cycle {walk} never starts; remove one of these flows"
+    yield Fault("flows", message)
+
+
+def _rates(parts: CellParts, flows: Sequence[Flow]) -> Iterator[Fault]:
+    """Yield the faults of the rates of tasks, if all tasks and flows are known."""
+    tasks = {name: task for name, task in parts.tasks.items() if task is not None}
+    ends = {name for flow in flows for name in (flow.source, flow.target)}
+    if len(tasks) == len(parts.tasks) and ends <= tasks.keys():
+        yield from rate_faults(tasks, flows)
 
 
 def _cycle(flows: Sequence[Flow]) -> list[str]:
