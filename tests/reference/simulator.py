@@ -1661,8 +1661,11 @@ class Simulation:
         pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
-        outputs = self.pipeline.outputs(job.task.name)
-        outputs = [flow for flow in outputs if self.rates.carries(flow, job.cycle)]
+        outputs = [
+            flow
+            for flow in self.pipeline.outputs(job.task.name)
+            if self.rates.carries(flow, job.cycle)
+        ]
         for flow in outputs:
             self.send_output(job.cell, flow, job)
         if job.cell == ITSELF and (SHADOW, job.cycle) in self.placed:
