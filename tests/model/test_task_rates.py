@@ -63,7 +63,7 @@ def fault_of(document: dict[str, Any], **tasks: dict[str, Any]) -> tuple[str, st
 def test_a_rate_passes_along_waited_flows_only() -> None:
     pipeline = made(cell()).pipeline
     assert pipeline.rates == {"camera": 10, "imu": 1, "detect": 10, "control": 1}
-    assert pipeline.on_the_way == {"imu", "control"}
+    assert pipeline.sink_rates == {"camera": (), "imu": (1,), "detect": (), "control": (1,)}
     assert (pipeline.sink_cycles, pipeline.has_idle_cycles, pipeline.has_rates) == (1, False, True)
 
 

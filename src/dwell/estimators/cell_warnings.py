@@ -479,7 +479,7 @@ def _odd_traces(problem: Problem) -> Iterator[Fault]:
     """Yield timed traces with instants that are probably wrong or in another unit."""
     period_ms = problem.pipeline.period_ms
     processes = chain.from_iterable(map(partial(processes_of, problem), problem.scenarios.values()))
-    traces = (process for _, process in processes if isinstance(process, Trace))
+    traces = (process for _, process, _ in processes if isinstance(process, Trace))
     for table in {id(trace.table): trace.table for trace in traces}.values():
         if table.time_ms is None:
             continue
@@ -521,9 +521,9 @@ def _rare_sinks(problem: Problem) -> Iterator[Fault]:
 def _late_offsets(problem: Problem) -> Iterator[Fault]:
     """Yield offsets beyond the deadline of tasks on the way to a sink."""
     pipeline = problem.pipeline
-    for name in pipeline.on_the_way:
+    for name, sinks in pipeline.sink_rates.items():
         offset_ms = pipeline.tasks[name].offset_ms
-        if offset_ms > pipeline.deadline_ms:
+        if sinks and offset_ms > pipeline.deadline_ms:
             yield Fault(
                 f"tasks.{name}.offset_ms",
                 f"{offset_ms:g} ms is beyond deadline_ms = {pipeline.deadline_ms:g}: each cycle "

@@ -222,7 +222,7 @@ class Playing:
             means = (
                 _mean(seen["l95_ms"]),
                 _mean(self.declared.l95_ms[name][stretch]),
-                _mean(seen["missed"]) / self._window,
+                _mean(seen["missed"]) / _mean(seen["counted"]),
                 _mean(self.declared.violation_rate[name][stretch]),
                 _mean(seen["uncut_ms"]),
                 *_mean_shares(tables.shares[0, stretch, 1]),
@@ -309,11 +309,14 @@ class Playing:
         self._declared_layers = tables.layers.copy()
         self._nothing_ns = np.zeros(self._real.cycles, np.int64)
         self._rows: dict[Part, list[TimesRow]] = {}
+        rates = _rates(problem)
         for _, played in self._replaced:
             for site, row in zip(played.sites, played.exec_ns, strict=True):
-                self._rows.setdefault(Site(*site), []).append(TimesRow.of(row))
+                part_rows = self._rows.setdefault(Site(*site), [])
+                part_rows.append(TimesRow.of(row, rates[site[0]]))
             for hop, row in zip(played.hops, played.delay_ns, strict=True):
-                self._rows.setdefault(Message(*hop), []).append(TimesRow.of(row))
+                part_rows = self._rows.setdefault(Message(*hop), [])
+                part_rows.append(TimesRow.of(row, rates.get(hop[:2], 1)))
         self._stretched: dict[Part, float] = {
             Site(*site): _stretched(self.problem, Site(*site)) for site in self._real.sites
         }
@@ -513,13 +516,20 @@ def _with_short_windows(problem: Problem) -> Problem:
     return replace(problem, window_cycles=LONGEST_WINDOW, controller=controller)
 
 
+def _rates(problem: Problem) -> dict[str | tuple[str, str], int]:
+    """Return the cycles from one run of each task to its next, and the same for messages."""
+    pipeline = problem.pipeline
+    messages = {(one.source, one.target): pipeline.message_rate(one) for one in pipeline.flows}
+    return {**pipeline.rates, **messages}
+
+
 def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:
     """Return the realisation of the undisturbed cell, changed to the measured conditions."""
     if present == Present():
         return real
     exec_ns, delay_ns, extra_ns = real.exec_ns.copy(), real.delay_ns.copy(), real.extra_ns.copy()
     segments = LinkSegments.of(real.link_segments)
-    state, rates = segments.table.copy(), segments.table_f.copy()
+    state, links, rates = segments.table.copy(), segments.table_f.copy(), _rates(problem)
     for part, values in present.demands.items():
         known: tuple[tuple[str, ...], ...] = real.sites
         times, stretched = exec_ns, 1.0
@@ -529,15 +539,16 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             known, times = real.hops, delay_ns
             extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
         if part in known:
-            fill([TimesRow.of(times[known.index(part)])], values, stretched, 0, 0)
+            rate = rates[part.task if isinstance(part, Site) else part[:2]]
+            fill([TimesRow.of(times[known.index(part)], rate)], values, stretched, 0, 0)
     for name, mbps in present.rates_mbps.items():
-        rates[state[:, 1] == segments.links.index(name), 0] = mbps
+        links[state[:, 1] == segments.links.index(name), 0] = mbps
     for name, share in _lost(present).items():
         mine = state[:, 1] == segments.links.index(name)
         if problem.fabric.links[name].retransmit_ms is None:
-            rates[mine, 1] = share
+            links[mine, 1] = share
         else:
-            rates[mine, 1] = 0.0
+            links[mine, 1] = 0.0
             state[mine, 2] = share >= 0.5
     begins = [NodeChange(0, name, 0, False) for name in problem.fabric.nodes]
     changes = NodeChanges.of([*begins, *real.node_changes])
@@ -549,7 +560,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
         delay_ns=delay_ns,
         extra_ns=extra_ns,
         node_changes=NodeChanges(changes.nodes, rows.view(np.int64).reshape(len(rows), 4)),
-        link_segments=LinkSegments(segments.links, state, rates),
+        link_segments=LinkSegments(segments.links, state, links),
     )
 
 
@@ -647,7 +658,7 @@ def _with_shadows(problem: Problem, plain: Declared, question: Question) -> Decl
 def _shown(problem: Problem, arrays: Arrays) -> tuple[Floats, Floats]:
     """Return L95, milliseconds, and V_D of every simulated window."""
     seen = arrays.tables.seen[0]
-    return seen["l95_ms"].copy(), seen["missed"] / problem.window_cycles
+    return seen["l95_ms"].copy(), seen["missed"] / seen["counted"]
 
 
 def _evidence_of(problem: Problem, real: Realisation, arrays: Arrays) -> Evidence:

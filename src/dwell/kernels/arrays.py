@@ -191,6 +191,8 @@ class Arrays:
         }
         if len(t.log) and not clock["logs_all"]:
             rings |= {"log": t.log, "log_outcome": t.log_outcome, "log_arrived": t.log_arrived}
+            if len(t.log_taken):
+                rings["log_taken"] = t.log_taken
         self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
@@ -200,6 +202,24 @@ BY_CELL = (
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
 )
+
+
+class JobLogs(NamedTuple):
+    """The log of a cell's jobs and messages.
+
+    Parameters
+    ----------
+    jobs, outcomes : arrays, shape (rows, cycles, tasks)
+        Instants and outcomes of all jobs.
+    arrived_ns, taken : int64 arrays, shape (rows, cycles, flows)
+        Arrival of each message, and cycle of the sampled message that a job of this cycle took; -1
+        for none. Flows have the order of `flow_rows`.
+    """
+
+    jobs: Rows
+    outcomes: NDArray[np.int8]
+    arrived_ns: Ints
+    taken: Ints
 
 
 class CellArrays:
@@ -232,18 +252,15 @@ class CellArrays:
             )
         return self._tables
 
-    def logs(self) -> tuple[Rows, NDArray[np.int8], Ints]:
-        """Return the instants and outcomes of all jobs, and the arrivals of all messages.
-
-        The shapes are (rows, cycles, tasks) and (rows, cycles, flows), with flows in the order of
-        `flow_rows`; an arrival is -1 if the message did not arrive. Needs a log of all jobs.
-        """
+    def logs(self) -> JobLogs:
+        """Return the log of all jobs and messages; needs a log of all jobs."""
         whole, part = self.whole.tables, self.part
         shape = len(whole.cells), int(whole.clock[0]["n_cycles"]), -1
         own = slice(part.row, part.row + part.rows), slice(part.cycles)
         tasks = *own, slice(part.tasks)
         log, outcome = whole.log.reshape(shape), whole.log_outcome.reshape(shape)
-        return log[tasks], outcome[tasks], whole.log_arrived.reshape(shape)[own]
+        arrived, taken = (table.reshape(shape)[own] for table in (whole.log_arrived, whole.log_taken))
+        return JobLogs(log[tasks], outcome[tasks], arrived, taken)
 
 
 def lay_out(
@@ -272,9 +289,6 @@ def lay_out(
         Samples for the shadow jobs of each cell (see `draw_shadows`); None if a cell sends no
         shadows.
     """
-    for problem, _ in cells:
-        if problem.pipeline.has_rates:
-            raise SimulationError(f"{problem.name} has `every` or `sampled`: not simulated yet")
     return _Layout(cells, shared, log_jobs, log_windows, decides, shadows).arrays()
 
 
@@ -313,6 +327,8 @@ class _Layout:
         self.behind: list[Ints] = []
         self.end_ns = 0
         self.outputs: list[int] = []
+        self.sampled: list[int] = []
+        self.sink_rates: list[int] = []
         self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
@@ -455,7 +471,9 @@ class _Layout:
             "flow_0": len(self.rows["flows"]),
             "candidate_0": part.candidate_0,
             "n_candidates": part.candidates,
-            "n_sinks": sum(not pipeline.outputs(name) for name in names),
+            "n_sinks": len(pipeline.sinks),
+            "sampled_0": len(self.sampled),
+            "n_sampled": sum(flow.sampled for flow in flows),
             "period_ns": pipeline.period_ns,
             "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
             "pair_0": len(self.shadow_parts),
@@ -471,20 +489,33 @@ class _Layout:
         self.capacity += [one.capacity for one in resources]
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         self.rows["flows"] += [
-            {"source": names.index(flow.source), "target": names.index(flow.target)}
+            {
+                "source": names.index(flow.source),
+                "target": names.index(flow.target),
+                "is_sampled": flow.sampled,
+                "every": pipeline.message_rate(flow),
+            }
             for flow in flows
         ]
+        self.sampled += [
+            flow_row[flow.source, flow.target] for flow in pipeline.flows if flow.sampled
+        ]
+        rates, needed_by = pipeline.rates, pipeline.sink_rates
         for name, task in pipeline.tasks.items():
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
             self.rows["tasks"].append(
                 {
-                    "n_in": len(pipeline.inputs(name)),
+                    "n_in": len(pipeline.waited(name)),
                     "n_out": len(outputs),
                     "out_0": len(self.outputs),
                     "offset_ns": round(task.offset_ms * 1e6),
+                    "every": rates[name],
+                    "rate_0": len(self.sink_rates),
+                    "n_rates": len(needed_by[name]),
                 }
             )
             self.outputs += outputs
+            self.sink_rates += needed_by[name]
 
     def _add_candidates(
         self,
@@ -685,6 +716,7 @@ class _Layout:
             "n_layers": n_layers,
             "n_resources": self.max_resources,
             "has_shared": len(self.cells) > 1 and bool(self.shared),
+            "has_rates": any(problem.pipeline.has_rates for problem, _ in self.cells),
             "n_cycles": cycles,
             "n_windows": windows,
             "n_looks": looks,
@@ -731,6 +763,8 @@ class _Layout:
         }
         lists: dict[str, list[Any]] = {
             "outputs": self.outputs,
+            "sampled": self.sampled,
+            "sink_rates": self.sink_rates,
             "cell_servers": self.cell_servers,
             "capacity": self.capacity,
             "site_of": self.site_of,
@@ -744,6 +778,8 @@ class _Layout:
             "latency_ns": np.full((cells, cycles), NEVER_NS),
             "log": _as_rows("log", np.full((logged * self.max_tasks, 6), -1)),
             "log_arrived": np.full((logged, self.max_flows), -1),
+            "log_taken": np.full((logged if clock["has_rates"] else 0, self.max_flows), -1),
+            "values": np.full((len(rows["sites"]) * clock["has_rates"], self.max_flows), -1),
             "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
             "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
             "soonest_ns": np.full((len(self.site_of), self.max_tasks), -1),

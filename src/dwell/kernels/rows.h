@@ -42,6 +42,7 @@ struct Crossing;  // of meter.cpp
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
   field(i64, has_shared) /* whether cells have servers in common */                              \
+  field(i64, has_rates) /* whether some tasks skip cycles, or flows are sampled */               \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
   field(i64, n_priced) /* columns of the outputs */                                              \
   field(i64, margin) field(i64, budget)                                                          \
@@ -74,14 +75,20 @@ struct Crossing;  // of meter.cpp
   field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
+  field(i32, sampled_0) field(i32, n_sampled) /* in `sampled` */                                 \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
   field(i32, shadow) field(i32, parent)
 
+// A task runs in every `every`-th cycle from 0 on. `n_in` counts its waited inputs. The rates of
+// the sinks to which waited flows lead from it, its own if it is a sink, are in `sink_rates`.
 #define DWELL_TASK(field)                                                                        \
-  field(i64, offset_ns)                                                                          \
-  field(i32, n_in) field(i32, n_out) field(i32, out_0) /* in `outputs` */
+  field(i64, offset_ns) field(i64, every)                                                        \
+  field(i32, n_in) field(i32, n_out) field(i32, out_0) /* in `outputs` */                        \
+  field(i32, rate_0) field(i32, n_rates)
 
-#define DWELL_FLOW(field) field(i32, source) field(i32, target)
+// A flow carries a message in every `every`-th cycle.
+#define DWELL_FLOW(field)                                                                        \
+  field(i64, every) field(i32, source) field(i32, target) field(i32, is_sampled)
 
 // A job occupies `need` of its server: cores, or threads that share the cores of a fair server, or
 // places of an accelerator. `threads` threads do its work. `own` is the row of its cell and server
@@ -168,7 +175,7 @@ struct Crossing;  // of meter.cpp
   field(i64, next) field(f64, beside_ns) field(i32, site)                    \
   field(i32, missing)
 
-// A cycle in flight. `live` counts its jobs and messages in flight.
+// A cycle in flight. `live` counts its jobs and messages in flight. `is_lost` is one of `Loss`.
 #define DWELL_SLOT(field)                                                                        \
   field(i64, cycle) field(i32, candidate) field(i32, pair) field(i32, live)                      \
   field(i32, sinks_left) field(i32, is_lost)
@@ -179,10 +186,10 @@ struct Crossing;  // of meter.cpp
   field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)               \
   field(i64, used_ns) field(i64, above_ns)
 
-// Metrics of cycles as known at the end of a window, or when a decision was due. `uncut_ms` is L95
-// without the limit `longest_ms` of the cell.
+// Metrics of cycles as known at the end of a window, or when a decision was due. `counted` cycles
+// are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell.
 #define DWELL_SEEN(field)                                                                        \
-  field(i64, first_cycle) field(i64, cycles) field(i64, missed)                                  \
+  field(i64, first_cycle) field(i64, cycles) field(i64, missed) field(i64, counted)              \
   field(f64, l95_ms) field(f64, uncut_ms)
 
 // Numbers by which a built-in policy with the estimator `profile` decides (rules.h): the policy's
@@ -336,7 +343,7 @@ DWELL_ROWS(DWELL_STRUCT)
 // shapes.
 #define DWELL_TABLES(table)                                                                      \
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
-  table(i32, outputs) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
+  table(i32, outputs) table(i32, sampled) table(i32, sink_rates) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
   table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
   table(Change, changes) table(f64, work) table(f64, switching)               \
@@ -345,13 +352,14 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Event, events) table(i32, following) table(i32, days) table(Held, held)                  \
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
-  table(f64, own_ns) table(i64, soonest_ns) table(i64, ages)                                     \
+  table(f64, own_ns) table(i64, soonest_ns) table(i64, ages) table(i64, values)                  \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \
   table(Decided, decided) table(f64, priced)                                                     \
-  table(i64, shadow_bytes) table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
+  table(i64, shadow_bytes) table(Log, log) table(i8, log_outcome) table(i64, log_arrived)        \
+  table(i64, log_taken)
 
 // clang-format on
 

@@ -255,16 +255,17 @@ class Pipeline:
         return any(flow.sampled for flow in self.flows) or max(every) > 1
 
     @property
-    def on_the_way(self) -> frozenset[str]:
-        """The sinks, and all tasks from which waited flows lead to a sink.
+    def sink_rates(self) -> dict[str, tuple[int, ...]]:
+        """Rates of the sinks to which waited flows lead from each task, or of the task if a sink.
 
-        Only these tasks determine the latency and the outcome of a cycle.
+        Only tasks with such a sink determine the latency and the outcome of a cycle.
         """
-        found = {*self.sinks}
+        rates, found = self.rates, dict[str, set[int]]()
         for name in reversed(self.topological()):
-            if any(not flow.sampled and flow.target in found for flow in self.outputs(name)):
-                found.add(name)
-        return frozenset(found)
+            outputs = self.outputs(name)
+            waited = [found[flow.target] for flow in outputs if not flow.sampled]
+            found[name] = set().union(*waited) if outputs else {rates[name]}
+        return {name: tuple(sorted(found[name])) for name in self.tasks}
 
     @property
     def sink_cycles(self) -> int:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 3
 
 #: Outcomes of a cycle or a job, in the order of the kernels' codes.
-OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied")
+OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied", "idle")
 OUTCOME_SENTENCES: Mapping[str, str] = {
     "done": "it was completed",
     "dropped": "a message or an input was lost",
@@ -31,6 +31,7 @@ OUTCOME_SENTENCES: Mapping[str, str] = {
     "node_down": "a node was down",
     "not_applied": "its command was ready, and the actuator raised",
     "in_flight": "unfinished at the end",
+    "idle": "no sink was due",
 }
 #: Explanation of each reason of a decision.
 REASON_SENTENCES: Mapping[Reason, str] = {

@@ -38,7 +38,7 @@ from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
 #: Columns of the kernel's table `seen`.
-SEEN = "first_cycle", "cycles", "missed", "l95_ms", "uncut_ms"
+SEEN = "first_cycle", "cycles", "missed", "counted", "l95_ms", "uncut_ms"
 
 
 def simulate(
@@ -373,9 +373,9 @@ class SimulatedStamper:
         return max(due_ns, self.release_ns.item(boundary) + self.grace_ns)
 
     def leave_to_kernel(self) -> None:
-        """Let the kernel decide if it implements the controller's rule."""
+        """Let the kernel decide if it implements the controller's rule; idle cycles it does not."""
         plain = plain_rule(self.controller)
-        if plain is None:
+        if plain is None or self.controller.problem.pipeline.has_idle_cycles:
             return
         numbers = {
             **plain.numbers,
@@ -403,7 +403,7 @@ class SimulatedStamper:
         self.controller.looked = LookedAt(self._window_of(boundary - 1), boundary - 1, cycles)
         if len(self.decided):
             self.course.move(self.names[self.decided.item(0)])
-        elif self.host_is_down(close_ns):
+        elif self.host_is_down(close_ns) or not self.seen[3].item(0, index):
             self.controller.miss()
             if not self.looks:
                 self.metrics.append((None, None, None))
@@ -436,8 +436,8 @@ class SimulatedStamper:
         if self.evidence is not None:
             first = boundary - self.every
             controller.learn(partial(self.evidence, first, boundary, close_ns))
-        _, cycles, missed, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
-        seen = l95_ms, missed / cycles, uncut_ms
+        _, _, missed, counted, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
+        seen = l95_ms, missed / counted, uncut_ms
         shares = self.shares[0, index]
         if self.looks:
             proposal = controller.propose_on(*seen, shares[1], recent=shares[0])

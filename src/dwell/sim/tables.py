@@ -12,7 +12,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms, moved_shares, seen_costs
-from dwell.kernels.arrays import CellArrays
+from dwell.kernels.arrays import CellArrays, flow_rows
+from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
@@ -127,6 +128,21 @@ class PlayedRealisation:
         return window_close_ns(self.problem, release_ns[beyond - 1], release_ns[beyond])
 
     @cached_property
+    def idle(self) -> NDArray[np.bool_] | None:
+        """Whether no sink is due in each cycle; None if a sink is due in all."""
+        if not self.problem.pipeline.has_idle_cycles:
+            return None
+        idle: NDArray[np.bool_] = self.arrays.tables.outcome[0] == CycleOutcome.IDLE
+        return idle
+
+    def share_of(self, cycles: NDArray[np.bool_]) -> Floats:
+        """Return the share of each window's cycles that are true, without idle cycles."""
+        if self.idle is None:
+            return self.by_window(cycles).mean(axis=1)
+        share: Floats = self.by_window(cycles).sum(axis=1) / self.seen["counted"]
+        return share
+
+    @cached_property
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
@@ -141,6 +157,8 @@ class PlayedRealisation:
         else:
             window, place = late.nonzero()
             missed[self.first[window] + place] = True
+        if self.idle is not None:
+            missed &= ~self.idle[: self.released]
         return missed
 
 
@@ -217,8 +235,8 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "warmup": np.arange(count) < problem.warmup_windows,
             "placement": Names(stamps[played.first], tuple(problem.candidates)),
             "mixed": mixed,
-            "l95_ms": lambda: final_l95_ms(played.by_window(played.arrays.tables.latency_ns[0])),
-            "violation_rate": lambda: played.by_window(played.missed).mean(axis=1),
+            "l95_ms": lambda: _final_l95_ms(played),
+            "violation_rate": lambda: played.share_of(played.missed),
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
@@ -226,6 +244,15 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             **_shadow_columns(played),
         }
     )
+
+
+def _final_l95_ms(played: PlayedRealisation) -> Floats:
+    """Return L95 of every window by the final latencies, without idle cycles."""
+    latency_ns = played.by_window(played.arrays.tables.latency_ns[0])
+    if played.idle is None:
+        return final_l95_ms(latency_ns)
+    rows = zip(latency_ns, played.by_window(played.idle), strict=True)
+    return np.array([final_l95_ms(latency[~idle]) for latency, idle in rows])
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
@@ -253,11 +280,11 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
 
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     """Return the metrics of windows at their closes; NaN while the controller's node was down."""
-    tables, window_cycles = played.arrays.tables, played.problem.window_cycles
+    tables = played.arrays.tables
     if played.looks or played.by_kernel:
         seen = {
             "l95_ms": played.seen["l95_ms"],
-            "violation_rate": played.seen["missed"] / window_cycles,
+            "violation_rate": played.seen["missed"] / played.seen["counted"],
         }
         seen["cost"] = (
             _costs(played, seen) if played.looks else tables.decided["measured"][: len(played.seen)]
@@ -329,7 +356,7 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
         used = tables.look_shares[0, :count, 1, 0].T
         columns |= {
             "seen_l95_ms": looked["l95_ms"],
-            "seen_violation_rate": looked["missed"] / looked["cycles"],
+            "seen_violation_rate": looked["missed"] / looked["counted"],
             **dict(zip((f"u_{one}" for one in controller.resources), used, strict=False)),
         }
     # The kernel's estimates have no errors.
@@ -349,7 +376,7 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
     cells = len(tables.cells)
-    log, outcome, _ = played.arrays.logs()
+    log, outcome, _, taken = played.arrays.logs()
     # The sites of a shadow follow the sites of its cell, in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
     site = tables.site_of - played.arrays.part.site_0
