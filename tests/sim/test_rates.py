@@ -190,7 +190,9 @@ def test_the_k_th_run_takes_the_k_th_value_of_its_stream() -> None:
     slow["tasks"]["imu"]["every"] = slow["tasks"]["control"]["every"] = 4
     every, tenth = from_document(fast), from_document(slow)
     runs = len(range(0, 120, CAMERA))
-    assert values_of(tenth, "camera")[::CAMERA].tolist() == values_of(every, "camera")[:runs].tolist()
+    assert (
+        values_of(tenth, "camera")[::CAMERA].tolist() == values_of(every, "camera")[:runs].tolist()
+    )
     assert not values_of(tenth, "camera").reshape(-1, CAMERA)[:, 1:].any()
     assert values_of(tenth, "imu")[::4].tolist() == values_of(every, "imu")[:30].tolist()
     delays = [draw(one, seed=3, windows=6).delay_ns[0] for one in (every, tenth)]
