@@ -14,6 +14,7 @@ from dwell.errors import ProblemError
 from dwell.model import (
     Bursts,
     Caps,
+    Chain,
     ControllerSettings,
     Execution,
     Flow,
@@ -101,6 +102,7 @@ flows:
   - {from: see, to: act, sampled: true}
   - {from: think, to: act}
   - {from: look, to: act}
+chains: {see-act: {from: see, to: act, max_age_ms: 90}}
 candidates: {LOC: {think: R}, FAR: {think: E}}
 objective:
   weights: {latency: 1.5, violations: 2, robot: 0.6, edge: 0.4, switching: 0.3, cloud: 0.2}
@@ -172,9 +174,10 @@ WORDS = (
 )
 #: Kinds whose keys are in a live cell's file.
 KINDS = (
-    *(Bursts, Caps, ControllerSettings, Endpoint, Episodes, Execution, Flow, Host, Link),
-    *(LinkDisturbance, LiveSettings, MovingTarget, Node, NodeDisturbance, Objective, Pipeline),
-    *(Problem, Quota, RosActuator, RosCommands, RosTopic, Servo, Targets, Task, Weights),
+    *(Bursts, Caps, Chain, ControllerSettings, Endpoint, Episodes, Execution, Flow, Host),
+    *(Link, LinkDisturbance, LiveSettings, MovingTarget, Node, NodeDisturbance, Objective),
+    *(Pipeline, Problem, Quota, RosActuator, RosCommands, RosTopic, Servo, Targets, Task),
+    Weights,
 )
 #: Keys that cannot be changed alone: ends of links and flows, kinds of accelerators, what excludes
 #: a phase or goes with a damping, the only source of stamps.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, PERIOD_MS, TIME_MS, Bound, require
+from dwell.model.chain import Chain
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
@@ -180,6 +181,10 @@ class Pipeline:
         default_factory=FrozenDict,
         tier="measured",
     )
+    chains: Mapping[str, Chain] = key(
+        "Chains of tasks whose data age is measured, by name.",
+        default_factory=FrozenDict,
+    )
     phase_ms: float | None = key(
         "Offset of all its releases, with their deadlines and windows, ms; less than P.",
         TIME_MS,
@@ -196,15 +201,15 @@ class Pipeline:
         require_names("tasks", self.tasks)
 
     def __repr__(self) -> str:
-        chains = [shortened(chain, " -> ") for chain in self.chains()]
+        ways = [shortened(way, " -> ") for way in self.ways()]
         return (
-            f"<Pipeline: {shortened(chains, '; ')}; period {self.period_ms:g} ms, "
+            f"<Pipeline: {shortened(ways, '; ')}; period {self.period_ms:g} ms, "
             f"deadline {self.deadline_ms:g} ms>"
         )
 
     def __str__(self) -> str:
-        """Return its flows as chains: ``a → b → d; c → b``."""
-        return "; ".join(" → ".join(chain) for chain in self.chains())
+        """Return its flows as ways: ``a → b → d; c → b``."""
+        return "; ".join(" → ".join(way) for way in self.ways())
 
     @property
     def first_release_ms(self) -> float:
@@ -308,15 +313,15 @@ class Pipeline:
                     order.append(flow.target)
         return tuple(order)
 
-    def chains(self) -> tuple[tuple[str, ...], ...]:
+    def ways(self) -> tuple[tuple[str, ...], ...]:
         """Return paths that contain every flow exactly once and every task at least once."""
         left = {name: [flow.target for flow in self.outputs(name)] for name in self.tasks}
         found: list[tuple[str, ...]] = []
         for name in self.topological():
             alone = not self.inputs(name) and not self.outputs(name)
             while left[name] or alone:
-                chain, alone = [name], False
-                while left[chain[-1]]:
-                    chain.append(left[chain[-1]].pop(0))
-                found.append(tuple(chain))
+                way, alone = [name], False
+                while left[way[-1]]:
+                    way.append(left[way[-1]].pop(0))
+                found.append(tuple(way))
         return tuple(found)

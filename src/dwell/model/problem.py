@@ -152,6 +152,7 @@ class Problem(Displayed):
             tasks=pipeline.tasks,
             flows=[(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
             scales=pipeline.scales,
+            chains=pipeline.chains,
             candidates=self.candidates,
             scenarios={
                 name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]

@@ -16,6 +16,7 @@ from graphlib import CycleError, TopologicalSorter
 from dwell.errors import Fault
 from dwell.model import table_columns
 from dwell.model.bounds import CLASS_PATH, shown
+from dwell.model.chain import Chain, chain_faults
 from dwell.model.controller_settings import ControllerSettings
 from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
@@ -66,6 +67,7 @@ class CellParts:
     tasks: Mapping[str, Task | None] = field(default_factory=dict)
     flows: Sequence[tuple[str, Flow]] = ()
     scales: Collection[str] = ()
+    chains: Mapping[str, Chain] = field(default_factory=dict)
     candidates: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     broken_candidates: Iterable[str] = ()
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
@@ -110,6 +112,7 @@ def find_faults(parts: CellParts) -> list[Fault]:
         *_links(parts),
         *_tasks(parts),
         *_flows(parts),
+        *_chains(parts),
         *_candidates(parts),
         *_scenarios(parts),
         *_objective(parts),
@@ -167,6 +170,7 @@ def _names(parts: CellParts) -> Iterator[Fault]:
         "nodes": parts.nodes,
         "tasks": parts.tasks,
         "scales": parts.scales,
+        "chains": parts.chains,
         "candidates": parts.candidates,
         "scenarios": parts.scenarios,
     }
@@ -272,6 +276,13 @@ def _rates(parts: CellParts, flows: Sequence[Flow]) -> Iterator[Fault]:
     ends = {name for flow in flows for name in (flow.source, flow.target)}
     if len(tasks) == len(parts.tasks) and ends <= tasks.keys():
         yield from rate_faults(tasks, flows)
+
+
+def _chains(parts: CellParts) -> Iterator[Fault]:
+    for name, chain in parts.chains.items():
+        yield from _unknown(f"chains.{name}.from", "task", chain.source, parts.tasks)
+        yield from _unknown(f"chains.{name}.to", "task", chain.target, parts.tasks)
+    yield from chain_faults(parts.chains, parts.tasks, [flow for _, flow in parts.flows])
 
 
 def _cycle(flows: Sequence[Flow]) -> list[str]:
@@ -490,7 +501,8 @@ def _columns(parts: CellParts) -> Iterator[Fault]:
         for kind in node.accelerators if node is not None else ():
             if message := bad_name(kind):
                 yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
-    yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
+    resources, chains = resources_of(parts.nodes), list(parts.chains)
+    yield from table_columns.clash_faults(resources, list(parts.candidates), chains)
 
 
 def too_many_shadows(fraction: float, candidates: int) -> str:

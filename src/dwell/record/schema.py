@@ -140,7 +140,7 @@ def _columns(
     resources = problem.fabric.resources.values()
     for column in those_with(features, TABLES[table].columns):
         kind: str | list[str] = names.get(column.kind) or column.kind
-        for one in columns_of(column.name, resources, names["candidate"]):
+        for one in columns_of(column.name, resources, names["candidate"], problem.pipeline.chains):
             yield one.name, column, kind
 
 

@@ -103,7 +103,8 @@ def simulate_realisation(
         Whether Python decides after every window, even if the kernel could; the Run is the same.
     """
     _check_fit(problem, realisation)
-    require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates))
+    chains = tuple(problem.pipeline.chains)
+    require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates), chains)
     asked = problem, realisation, policy, estimator, jobs, guard, by_window
     # Simulate without shadows first, which is faster, and again with shadows only if the guard
     # wants probes. Both give the same up to the first probe.
