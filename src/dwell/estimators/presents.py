@@ -314,7 +314,7 @@ class Playing:
             for site, row in zip(played.sites, played.exec_ns, strict=True):
                 part_rows = self._rows.setdefault(Site(*site), [])
                 part_rows.append(TimesRow.of(row, rates[site[0]]))
-            for hop, row in zip(played.hops, played.delay_ns, strict=True):
+            for hop, row in zip(played.hops, played.delay_ns, strict=False):
                 part_rows = self._rows.setdefault(Message(*hop), [])
                 part_rows.append(TimesRow.of(row, rates.get(hop[:2], 1)))
         self._stretched: dict[Part, float] = {
@@ -351,7 +351,9 @@ class Playing:
         tables = self._first.tables
         for part in present.demands:
             if part in self._hops:
-                layers = tables.layers[self._hops[part] :: len(self._hops)]  # shadows' come after
+                # The layers of shadows come after.
+                every = len(self._hops) + len(self._real.forwards)
+                layers = tables.layers[self._hops[part] :: every]
                 layers[layers != 0] = self._nothing_ns.ctypes.data
         for link, mbps in present.rates_mbps.items():
             tables.rates["rate_mbps"][self._segments[link]] = mbps
@@ -537,7 +539,7 @@ def realised(problem: Problem, real: Realisation, present: Present) -> Realisati
             stretched = _stretched(problem, part)
         else:
             known, times = real.hops, delay_ns
-            extra_ns[[real.hops[hop] == part for hop, _ in real.layers]] = 0
+            extra_ns[[real.hops[hop : hop + 1] == (part,) for hop, _ in real.layers]] = 0
         if part in known:
             rate = rates[part.task if isinstance(part, Site) else part[:2]]
             fill([TimesRow.of(times[known.index(part)], rate)], values, stretched, 0, 0)

@@ -163,7 +163,7 @@ class Arrays:
         """Double the capacity of the queue of events and of the held messages."""
         t = self.tables
         room = 2 * len(t.events)
-        names = ("events", "following", "held")
+        names = ("events", "following", "held", "repeats")
         self._use(t._replace(**{name: np.resize(getattr(t, name), room) for name in names}))
 
     def grow_ring(self) -> None:
@@ -474,6 +474,8 @@ class _Layout:
             "n_sinks": len(pipeline.sinks),
             "sampled_0": len(self.sampled),
             "n_sampled": sum(flow.sampled for flow in flows),
+            "forward_0": len(self.rows["forwards"]),
+            "n_forwards": len(real.forwards),
             "period_ns": pipeline.period_ns,
             "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
             "pair_0": len(self.shadow_parts),
@@ -529,6 +531,7 @@ class _Layout:
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         names = list(problem.pipeline.tasks)
         site_row = self._add_sites(index, problem, real, names)
+        self._add_forwards(problem, real, hop_0 + len(real.hops), site_row)
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
             self.site_of.append(on + [-1] * (self.max_tasks - len(on)))
@@ -540,6 +543,22 @@ class _Layout:
             ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
             self.back_ns.append(back_ns(problem, placement))
+
+    def _add_forwards(
+        self, problem: Problem, real: Realisation, hop_0: int, site_row: Mapping[tuple[str, str], int]
+    ) -> None:
+        """Add the forwards of sampled messages; their hops follow the hops of flows."""
+        ends = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
+        for hop, (source, target, name) in enumerate(real.forwards, hop_0):
+            link = problem.fabric.links[name]
+            self.rows["forwards"].append(
+                {
+                    "flow": ends.index((source, target)),
+                    "from_site": site_row[target, link.source],
+                    "to_site": site_row[target, link.target],
+                    "hop": hop,
+                }
+            )
 
     def _add_pairs(self, problem: Problem) -> None:
         """Add the roles of the tasks for a shadow, by pair of candidates."""
@@ -657,8 +676,9 @@ class _Layout:
         payload |= {
             (task.name, task.name): task.state_bytes for task in problem.pipeline.tasks.values()
         }
+        rows = self._addresses(real.delay_ns), real.loss_keys
         for (source, target, link_name), delay_ns, loss_key in zip(
-            real.hops, self._addresses(real.delay_ns), real.loss_keys, strict=True
+            (*real.hops, *real.forwards), *rows, strict=True
         ):
             self.rows["hops"].append(
                 {
@@ -677,13 +697,17 @@ class _Layout:
         limits = (
             ("cells", len(self.rows["cells"]), codes.CELL_MASK),
             ("tasks of a cell", self.max_tasks, codes.ITEM_MASK),
-            ("flows of a cell", self.max_flows, codes.MOST_FLOWS),
+            ("flows and forwards of a cell", self._most_messages(), codes.MOST_FLOWS),
             ("feasible (task, node) pairs", len(self.rows["sites"]), codes.ITEM_MASK),
             ("nodes and accelerators", len(self.rows["servers"]), codes.ITEM_MASK - 1),
         )
         for what, number, limit in limits:
             if number > limit:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
+
+    def _most_messages(self) -> int:
+        """Largest number of flows of a cell, and of forwards of its sampled flows."""
+        return self.max_flows + max(row["n_forwards"] for row in self.rows["cells"])
 
     def _foreign(self, server: Mapping[str, Any], changes: Rows) -> int:
         """Largest number of a server's foreign threads that take turns; 0 without turns."""
@@ -734,6 +758,7 @@ class _Layout:
         room = {
             "events": 4 * margin,
             "held": len(rows["events"]) + 4 * margin,
+            "repeats": len(rows["events"]) + 4 * margin,
             "running": base,
             "waiting": base,
             "jobs": cells * slots * self.max_tasks,

@@ -398,6 +398,7 @@ void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
   s.cell(cell).released = cycle + 1;
   if (!S::kPlain) give_up_before(s, cell, cycle, now);
+  if (S::kRates) move_values(s, cell, cycle, now);
   clear_log(s, cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
   if (!S::kPlain) {

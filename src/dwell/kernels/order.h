@@ -57,6 +57,12 @@ bool is_given_up(const S& s, i64 cell, i64 cycle) {
   return cycle + parent.given_up_after < parent.released;
 }
 
+// Whether the item of an arrival, or of a repeat, is a forward: after all flows, lost ones included.
+template <class S>
+bool is_forward(const S& s, i64 item) {
+  return S::kRates && item >= kLostOnLink + s.n_flows;
+}
+
 // Adds a message behind all held messages; `key` is the event of its arrival.
 template <class S>
 void hold(S& s, i64 link, i64 key, i64 arrival_ns) {
@@ -129,6 +135,7 @@ template <class S>
     held.arrival_ns = kUnknown;
     const i64 cell = cell_of(held.key), cycle = cycle_of(held.key);
     if (kind_of(held.key) != kArrival || is_given_up(s, cell, cycle)) continue;
+    if (is_forward(s, item_of(held.key))) continue;
     s.slot(cell, cycle).live -= 1;
     lose_input(s, cell, cycle, item_of(held.key) & ~kLostOnLink, kInFlight);
   }

@@ -296,10 +296,17 @@ class Drawing:
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
         self.hops = _hops(problem)
+        #: Shadow jobs bring no values, so nothing of theirs is forwarded.
+        self.forwards = () if shadow else tuple(_forwards(problem))
+        #: Link of each hop and forward, with the prefix and the end of the names of its streams.
+        self.sent_over = [
+            *((hop[2], "", _hop_name(hop)) for hop in self.hops),
+            *((hop[2], "forward/", _hop_name(hop)) for hop in self.forwards),
+        ]
         rates = problem.pipeline.rates
         #: Cycles from one value of each row to its next; all other values are 0.
         self.site_rates = [rates[task] for task, _ in self.sites]
-        self.hop_rates = _hop_rates(problem, self.hops)
+        self.hop_rates = _hop_rates(problem, (*self.hops, *self.forwards))
         self.paths: dict[str, Path] = {}
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
@@ -334,6 +341,7 @@ class Drawing:
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
             streams=self.streams,
+            forwards=self.forwards,
         )
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
@@ -354,13 +362,15 @@ class Drawing:
             exec_ns=exec_ns,
             delay_ns=delay_ns,
             loss_keys=self._loss_keys(),
+            layers=self._layers(),
             extra_ns=extra_ns,
+            forwards=self.forwards,
         )
 
     def _filled(self, cycles: int) -> Ints:
         """Sample the next cycles, with one row per site, then per hop, then per extra delay."""
         # One block of memory: the system uses larger pages for large blocks.
-        rows = len(self.sites) + len(self.hops) + len(self._layers())
+        rows = len(self.sites) + len(self.sent_over) + len(self._layers())
         table = np.empty((rows, cycles), np.int64)
         for at in range(0, cycles, BLOCK):
             exec_ns, delay_ns, extra_ns = self._parts(table[:, at : at + BLOCK])
@@ -387,10 +397,11 @@ class Drawing:
     def _parts(self, table: Ints) -> list[Ints]:
         """Return the rows of sites, of hops, and of layers of extra delay."""
         sites = len(self.sites)
-        return np.split(table, (sites, sites + len(self.hops)))
+        return np.split(table, (sites, sites + len(self.sent_over)))
 
     def _loss_keys(self) -> NDArray[np.uint64]:
-        return np.array([self._key(f"loss/{_hop_name(hop)}") for hop in self.hops], np.uint64)
+        names = [f"{prefix}loss/{name}" for _, prefix, name in self.sent_over]
+        return np.array([self._key(name) for name in names], np.uint64)
 
     @cached_property
     def changes(self) -> tuple[NodeChanges, LinkSegments]:
@@ -507,17 +518,18 @@ class Drawing:
     def _fill_delays(self, out: Ints, at: int) -> None:
         """Sample the next delays, one row per hop."""
         links = self.problem.fabric.links
-        for row, hop, rate in zip(out, self.hops, self.hop_rates, strict=True):
-            path = self._path(links[hop[2]].delay_ms, f"delay/{_hop_name(hop)}", rate)
+        for row, sent, rate in zip(out, self.sent_over, self.hop_rates, strict=True):
+            link, prefix, name = sent
+            path = self._path(links[link].delay_ms, f"{prefix}delay/{name}", rate)
             self._fill(row, at, rate, path)
 
     def _fill_extra(self, out: Ints, at: int) -> None:
         """Sample the next extra delays, one row per layer."""
         row = 0
-        for hop, rate in zip(self.hops, self.hop_rates, strict=True):
-            for ordinal, (process, count) in enumerate(self._added(hop[2])):
+        for (link, prefix, name), rate in zip(self.sent_over, self.hop_rates, strict=True):
+            for ordinal, (process, count) in enumerate(self._added(link)):
                 rows = out[row : row + count]
-                path = self._path(process, f"extra/{ordinal}/{_hop_name(hop)}", rate)
+                path = self._path(process, f"{prefix}extra/{ordinal}/{name}", rate)
                 self._fill(rows[-1], at, rate, path)
                 if count > 1:
                     _split(rows)
@@ -527,8 +539,8 @@ class Drawing:
         """Return the hop and number of each layer of extra delay."""
         return tuple(
             (i, layer)
-            for i, hop in enumerate(self.hops)
-            for layer in range(sum(count for _, count in self._added(hop[2])))
+            for i, (link, *_) in enumerate(self.sent_over)
+            for layer in range(sum(count for _, count in self._added(link)))
         )
 
     def _added(self, name: str) -> list[tuple[Process, int]]:
@@ -664,6 +676,17 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
                 hops[flow.source, flow.target, link] = None
     # Always add the hops of states: cold and warm migrations then have the same realisation.
     return (*hops, *_state_hops(problem))
+
+
+def _forwards(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    """Yield the sampled flows with the links between nodes of their targets, by flow, then by link."""
+    for flow in problem.pipeline.flows:
+        if not flow.sampled:
+            continue
+        hosts = {placement[flow.target] for placement in problem.candidates.values()}
+        for link in problem.fabric.links.values():
+            if {link.source, link.target} <= hosts:
+                yield flow.source, flow.target, link.name
 
 
 def _hop_rates(problem: Problem, hops: Sequence[tuple[str, str, str]]) -> list[int]:

@@ -48,7 +48,7 @@ struct Crossing;  // of meter.cpp
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs keep all cycles, or only the ring's */                    \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
-  field(i64, n_held)                                                                             \
+  field(i64, n_held) field(i64, n_repeats)                                                       \
   field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
   field(i64, pauses) /* whether a call ends when a decision is due */                            \
@@ -76,6 +76,7 @@ struct Crossing;  // of meter.cpp
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
   field(i32, sampled_0) field(i32, n_sampled) /* in `sampled` */                                 \
+  field(i32, forward_0) field(i32, n_forwards) /* in `forwards` */                               \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
   field(i32, shadow) field(i32, parent)
 
@@ -89,6 +90,14 @@ struct Crossing;  // of meter.cpp
 // A flow carries a message in every `every`-th cycle.
 #define DWELL_FLOW(field)                                                                        \
   field(i64, every) field(i32, source) field(i32, target) field(i32, is_sampled)
+
+// A sampled flow over a link from a site of its target to another site: the messages that a node
+// forwards after a move. Rows have the order of the flows, then of the links, of the file.
+#define DWELL_FORWARD(field)                                                                     \
+  field(i32, flow) field(i32, from_site) field(i32, to_site) field(i32, hop)
+
+// The lost attempts of a forward that will be sent again; `key` is the event of its arrival.
+#define DWELL_REPEAT(field) field(i64, key) field(i64, attempt)
 
 // A job occupies `need` of its server: cores, or threads that share the cores of a fair server, or
 // places of an accelerator. `threads` threads do its work. `own` is the row of its cell and server
@@ -317,6 +326,7 @@ struct Crossing;  // of meter.cpp
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)                            \
   row(Link, DWELL_LINK) row(Held, DWELL_HELD)                                                    \
+  row(Forward, DWELL_FORWARD) row(Repeat, DWELL_REPEAT)                                          \
   row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                                              \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
@@ -345,11 +355,12 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
   table(i32, outputs) table(i32, sampled) table(i32, sink_rates) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
-  table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
+  table(Hop, hops) table(Forward, forwards) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
   table(Change, changes) table(f64, work) table(f64, switching)               \
   table(i8, tiers) table(i16, stamps)                                                            \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
   table(Event, events) table(i32, following) table(i32, days) table(Held, held)                  \
+  table(Repeat, repeats)                                                                         \
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
   table(f64, own_ns) table(i64, soonest_ns) table(i64, ages) table(i64, values)                  \

@@ -103,6 +103,7 @@ class Tables(NamedTuple):
     back_ns: Ints  # (candidates,) time from a completion until the guard learns of it
     shadow_parts: NDArray[np.int8]  # (pairs of candidates, tasks)
     hops: Rows  # (hops,)
+    forwards: Rows  # (forwards,)
     layers: NDArray[np.uint64]  # (hops, layers) address of the extra delays, 0 for none
     segments: Rows  # (segments,)
     rates: Rows  # (segments,)
@@ -120,6 +121,7 @@ class Tables(NamedTuple):
     following: NDArray[np.int32]
     days: NDArray[np.int32]
     held: Rows  # messages that wait for others, or for their repeat; as many rows as events
+    repeats: Rows  # forwards that will be sent again; as many rows as events
     running: Rows  # per server a heap of running jobs by virtual finish
     waiting: Rows  # per server a heap of jobs that wait for cores
     dirty: NDArray[np.int32]  # servers to look after at the end of the event
