@@ -207,13 +207,14 @@ def make_case(
     orders: bool = False,
     in_order: bool = False,
     rates: bool = False,
+    idle: bool = True,
 ) -> Case:
     rng = Random(seed)
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
     if in_order:
         problem = with_order(problem, Random(seed), whole_ms=whole_ms)
     if rates:
-        problem = with_rates(problem, Random(f"{seed} rates"))
+        problem = with_rates(problem, Random(f"{seed} rates"), idle=idle)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
     names = tuple(random_stamps(rng, problem, windows))
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
@@ -288,9 +289,8 @@ def make_guarded(
     rates: bool = False,
 ) -> Case:
     """Make a case whose cell has a guard."""
-    case = make_case(
-        *(seed, schedulers), whole_ms=whole_ms, orders=orders, in_order=in_order, rates=rates
-    )
+    of = {"whole_ms": whole_ms, "orders": orders, "in_order": in_order, "rates": rates}
+    case = make_case(seed, schedulers, **of, idle=False)
     rng = Random(seed)
     names = list(case.problem.candidates)
     settings = replace(
@@ -827,6 +827,8 @@ def compare(
         case = make(
             *(seed, schedulers), whole_ms=whole_ms, orders=orders, in_order=in_order, rates=rates
         )
+        if rates and not case.problem.pipeline.has_rates:
+            continue
         if jitter:
             case = jittered(case, Random(seed), whole_ms=whole_ms)
         found = (
@@ -839,6 +841,34 @@ def compare(
             failures.append(f"{make.__name__}({seed}, {schedulers}, {how}): {found[:3]}")
     assert not failures, f"{len(failures)} of {len(seeds)} differ:\n" + "\n".join(failures[:10])
     assert excluded <= math.ceil(MOST_EXCLUDED * len(seeds))
+
+
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])
+@pytest.mark.parametrize("stamped", [False, True], ids=["decided", "stamped"])
+def test_several_rates_equal_to_the_nanosecond(part: str, stamped: bool, whole_ms: bool) -> None:
+    compare(part, ("fifo", "priority"), whole_ms=whole_ms, stamped=stamped, rates=True)
+
+
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])
+@pytest.mark.parametrize("stamped", [False, True], ids=["decided", "stamped"])
+def test_several_rates_under_orders_equal_to_the_nanosecond(
+    part: str, stamped: bool, whole_ms: bool
+) -> None:
+    how = {"whole_ms": whole_ms, "stamped": stamped, "orders": True, "in_order": whole_ms}
+    compare(part, ("fifo", "priority"), **how, rates=True)
+
+
+@pytest.mark.parametrize("jitter", [False, True], ids=["", "jitter"])
+def test_several_rates_with_a_guard_equal_to_the_nanosecond(part: str, jitter: bool) -> None:
+    compare(part, ("fifo", "priority"), orders=True, guarded=True, jitter=jitter, rates=True)
+
+
+@pytest.mark.parametrize("schedulers", [("fair",), ("turns",)], ids="-".join)
+def test_several_rates_on_shared_cores_equal_to_the_nanosecond(
+    part: str, schedulers: Sequence[Scheduler]
+) -> None:
+    tolerance_ns = FAIR_TOLERANCE_NS if "fair" in schedulers else 0
+    compare(part, schedulers, tolerance_ns, rates=True)
 
 
 @pytest.mark.parametrize(
