@@ -16,11 +16,12 @@ from dwell.kernels.arrays import CellArrays, flow_rows
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
-from dwell.model import REASONS, Problem
+from dwell.model import REASONS, Chain, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
+from dwell.sim.chain_ages import age_l95_ms, age_missed, chain_ages_ns
 
 if TYPE_CHECKING:
     import polars as pl
@@ -241,6 +242,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
+            **_age_columns(played),
             **_shadow_columns(played),
         }
     )
@@ -253,6 +255,27 @@ def _final_l95_ms(played: PlayedRealisation) -> Floats:
         return final_l95_ms(latency_ns)
     rows = zip(latency_ns, played.by_window(played.idle), strict=True)
     return np.array([final_l95_ms(latency[~idle]) for latency, idle in rows])
+
+
+def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
+    """Return the L95 of each chain's data age, and the share over its bound."""
+    columns: dict[str, Callable[[], NDArray[np.generic]]] = {}
+    for name, chain in played.problem.pipeline.chains.items():
+        ages_ns = cache(partial(_ages_ns, played, chain))
+        columns[f"age_l95_{name}"] = partial(_on_ages, ages_ns, age_l95_ms)
+        over = partial(age_missed, max_age_ms=chain.max_age_ms)
+        columns[f"age_missed_{name}"] = partial(_on_ages, ages_ns, over)
+    return columns
+
+
+def _on_ages(ages_ns: Callable[[], Ints], metric: Callable[[Ints], Floats]) -> Floats:
+    return metric(ages_ns())
+
+
+def _ages_ns(played: PlayedRealisation, chain: Chain) -> Ints:
+    """Return a chain's data ages by window."""
+    pipeline, realisation = played.problem.pipeline, played.realisation
+    return played.by_window(chain_ages_ns(pipeline, chain, realisation, played.arrays))
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
