@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from dwell import draw, simulate, simulate_realisation
+from dwell import draw, simulate
 from dwell.cellfile.cell import from_document
-from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.kernels.advance import play
+from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.model import Problem
+from dwell.model.number_arrays import Ints
 from dwell.record import Run
 from dwell.study.summary import summarise
 
@@ -174,10 +173,11 @@ def test_a_task_with_sampled_inputs_alone_runs_at_its_own_rate() -> None:
 DRAWN = {"lognormal": {"mean": 5, "cv": 0.3}}
 
 
-def values_of(problem: Problem, task: str) -> np.ndarray[Any, np.dtype[np.int64]]:
+def values_of(problem: Problem, task: str) -> Ints:
     real = draw(problem, seed=3, windows=6)
     (row,) = [i for i, (name, _) in enumerate(real.sites) if name == task]
-    return real.exec_ns[row]
+    values: Ints = real.exec_ns[row]
+    return values
 
 
 def test_the_k_th_run_takes_the_k_th_value_of_its_stream() -> None:
@@ -190,7 +190,9 @@ def test_the_k_th_run_takes_the_k_th_value_of_its_stream() -> None:
     slow["tasks"]["imu"]["every"] = slow["tasks"]["control"]["every"] = 4
     every, tenth = from_document(fast), from_document(slow)
     runs = len(range(0, 120, CAMERA))
-    assert values_of(tenth, "camera")[::CAMERA].tolist() == values_of(every, "camera")[:runs].tolist()
+    assert (
+        values_of(tenth, "camera")[::CAMERA].tolist() == values_of(every, "camera")[:runs].tolist()
+    )
     assert not values_of(tenth, "camera").reshape(-1, CAMERA)[:, 1:].any()
     assert values_of(tenth, "imu")[::4].tolist() == values_of(every, "imu")[:30].tolist()
     delays = [draw(one, seed=3, windows=6).delay_ns[0] for one in (every, tenth)]
