@@ -838,6 +838,8 @@ class Simulation:
         self.flawed: set[tuple[int, int]] = set()
         # Newest cycle that a node has of a sampled flow, by the flow's place and the node.
         self.values: dict[tuple[int, str], int] = {}
+        # Newest cycle that has been forwarded of it over a link.
+        self.forwarded: dict[tuple[int, str], int] = {}
         self.inputs: dict[tuple[int, int, str], list[tuple[int, Job]]] = {}
         self.lost_joins: set[tuple[int, int, str]] = set()
         self.jobs: dict[tuple[int, int, str], Job] = {}
@@ -1744,8 +1746,10 @@ class Simulation:
         number = self.pipeline.flows.index(flow)
         cycle = self.values.get((number, node), -1)
         link = f"{node}->{place}"
-        if cycle <= self.values.get((number, place), -1) or link not in self.problem.fabric.links:
+        known = max(self.values.get((number, place), -1), self.forwarded.get((number, link), -1))
+        if cycle <= known or link not in self.problem.fabric.links:
             return
+        self.forwarded[number, link] = cycle
 
         def arrive() -> None:
             if not self.nodes[place].down:
