@@ -128,7 +128,8 @@ def test_rates_of_a_join_are_multiples() -> None:
     document["flows"][2]["sampled"] = False
     path, message = fault_of(document, imu={"every": 4}, control={"every": 10})
     assert path == "tasks.control.every"
-    assert "imu (every 4)" in message and "sampled: true" in message
+    assert "imu (every 4)" in message
+    assert "sampled: true" in message
 
 
 def test_rates_coincide_within_a_bound() -> None:
@@ -160,7 +161,8 @@ def test_a_sink_runs_in_each_window() -> None:
     document["flows"][2]["sampled"] = False
     path, message = fault_of(document, control={"every": 10})
     assert path == "window_cycles"
-    assert "control" in message and "at least 10" in message
+    assert "control" in message
+    assert "at least 10" in message
 
 
 def test_the_time_between_decisions_is_a_multiple_of_the_interval_of_a_sink() -> None:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 
-from dwell import draw, simulate, simulate_realisation
+from dwell import draw, simulate
 from dwell.cellfile.cell import from_document
-from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.kernels.advance import play
+from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.model import Problem
+from dwell.model.number_arrays import Ints
 from dwell.record import Run
 from dwell.study.summary import summarise
 
@@ -174,10 +173,11 @@ def test_a_task_with_sampled_inputs_alone_runs_at_its_own_rate() -> None:
 DRAWN = {"lognormal": {"mean": 5, "cv": 0.3}}
 
 
-def values_of(problem: Problem, task: str) -> np.ndarray[Any, np.dtype[np.int64]]:
+def values_of(problem: Problem, task: str) -> Ints:
     real = draw(problem, seed=3, windows=6)
     (row,) = [i for i, (name, _) in enumerate(real.sites) if name == task]
-    return real.exec_ns[row]
+    values: Ints = real.exec_ns[row]
+    return values
 
 
 def test_the_k_th_run_takes_the_k_th_value_of_its_stream() -> None:
@@ -217,3 +217,68 @@ def test_rates_of_one_change_nothing() -> None:
     one, other = (simulate(from_document(cell), seed=1, windows=3) for cell in (plain, stated))
     assert one.cycles.equals(other.cycles)
     assert one.windows.equals(other.windows)
+
+
+def moving(*, payload: int = 0, **changes: Any) -> Problem:
+    """The loop with a control that may run on either node; a move takes effect at cycle 20."""
+    cell = document(**changes)
+    cell["tasks"]["control"]["on"] = {"R": {"exec_ms": 2}, "E": {"exec_ms": 2}}
+    cell["flows"][2]["bytes"] = payload
+    cell["candidates"] = {"LOC": {"control": "R"}, "FAR": {"control": "E"}}
+    return from_document(cell)
+
+
+def taken_by_control(problem: Problem, stamps: list[int]) -> list[int]:
+    """Return the cycle of the detection that control took in each cycle."""
+    arrays = lay_out([(problem, draw(problem, seed=1, windows=2))], log_jobs=True)
+    arrays.tables.stamps[0] = stamps
+    play(arrays)
+    logs = CellArrays(arrays).logs()
+    taken: list[int] = logs.taken[0][:, flow_rows(problem.pipeline)][:, 2].tolist()
+    return taken
+
+
+def test_a_node_forwards_its_value_when_the_target_moves() -> None:
+    # Detections end at 43, 143, 243 ms on E. Control moves from E to R with cycle 20, at 200 ms:
+    # the value of cycle 10 is forwarded and arrives at 202 ms; imu ends at 201 ms, before that.
+    stamps = [1] * 20 + [0] * 20
+    expected = [-1] * 4 + [0] * 10 + [10] * 6 + [-1] + [10] * 4 + [20] * 10 + [30] * 5
+    # Control on E takes its job 1 + 2 ms after the release: at 43 ms (cycle 4) the value has come.
+    assert taken_by_control(moving(), stamps) == expected
+
+
+def test_what_arrives_at_an_old_node_is_forwarded_until_the_first_new_message() -> None:
+    # The detection of cycle 20 is sent to E, under FAR, and ends at 243 ms; control moves at 230 ms.
+    stamps = [1] * 23 + [0] * 17
+    taken = taken_by_control(moving(), stamps)
+    # It arrives on R at 245 ms: control takes it from cycle 25 on, at 251 ms.
+    assert taken[23:] == [-1, 10, *[20] * 10, *[30] * 5]
+
+
+def test_without_a_direct_link_there_is_no_value_until_the_next_message() -> None:
+    cell = document()
+    cell["nodes"]["C"] = {"tier": "cloud", "cores": 4}
+    cell["links"].append({"from": "E", "to": "C", "both_ways": True, "delay_ms": 2})
+    cell["links"].append({"from": "R", "to": "C", "delay_ms": 2})
+    cell["tasks"]["control"]["on"] = {"R": {"exec_ms": 2}, "C": {"exec_ms": 2}}
+    cell["candidates"] = {"LOC": {"control": "R"}, "FAR": {"control": "C"}}
+    taken = taken_by_control(from_document(cell), [1] * 20 + [0] * 20)
+    # No link leads from C to R; the detection of cycle 20 arrives at 245 ms.
+    assert taken[18:27] == [10, 10, -1, -1, -1, -1, -1, 20, 20]
+
+
+def test_a_node_that_goes_down_loses_its_values() -> None:
+    cell = document(scenarios={"dip": [{"node": "R", "at_s": 0.2, "for_s": 0.005, "down": True}]})
+    problem = from_document(cell)
+    arrays = lay_out([(problem, draw(problem, scenario="dip", seed=1, windows=2))], log_jobs=True)
+    play(arrays)
+    taken = CellArrays(arrays).logs().taken[0][:, flow_rows(problem.pipeline)][:, 2].tolist()
+    # The camera of cycle 20 is lost at 202 ms, so the next detection is the one of cycle 30.
+    assert taken[18:36] == [10, 10, *[-1] * 15, 30]
+
+
+def test_a_forward_occupies_the_link() -> None:
+    # 100,000 bytes at 100 Mbit/s take 8 ms.
+    link = {"delay_ms": 2, "rate_mbps": 100, "both_ways": True, "from": "R", "to": "E"}
+    taken = taken_by_control(moving(payload=100_000, links=[link]), [1] * 20 + [0] * 20)
+    assert taken[19:23] == [10, -1, 10, 10]

@@ -521,8 +521,10 @@ def _with_short_windows(problem: Problem) -> Problem:
 def _rates(problem: Problem) -> dict[str | tuple[str, str], int]:
     """Return the cycles from one run of each task to its next, and the same for messages."""
     pipeline = problem.pipeline
-    messages = {(one.source, one.target): pipeline.message_rate(one) for one in pipeline.flows}
-    return {**pipeline.rates, **messages}
+    rates: dict[str | tuple[str, str], int] = dict(pipeline.rates.items())
+    for flow in pipeline.flows:
+        rates[flow.source, flow.target] = pipeline.message_rate(flow)
+    return rates
 
 
 def realised(problem: Problem, real: Realisation, present: Present) -> Realisation:

@@ -325,7 +325,9 @@ def price_of(
     return Price(
         l95_ms=l95_ms,
         l95_error_ms=l95_error_ms,
-        uncut_l95_ms=math.inf if lost > 0.05 * np.count_nonzero(~is_idle) else max(float(uncut_ms.mean()), l95_ms),
+        uncut_l95_ms=math.inf
+        if lost > 0.05 * np.count_nonzero(~is_idle)
+        else max(float(uncut_ms.mean()), l95_ms),
         violation_rate=violation_rate,
         violation_error=violation_error,
         latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,

@@ -200,9 +200,9 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     processes = list(processes_of(problem, items))
     tables = {id(one.table): one.table for _, one, _ in processes if isinstance(one, Trace)}
     slowest = dict.fromkeys(tables, 1)
-    for _, one, rate in processes:
-        if isinstance(one, Trace) and one.table.by == "row":
-            slowest[id(one.table)] = max(slowest[id(one.table)], rate)
+    for _, process, rate in processes:
+        if isinstance(process, Trace) and process.table.by == "row":
+            slowest[id(process.table)] = max(slowest[id(process.table)], rate)
     loops = tuple(
         slowest[table_id] * table.loop_cycles(problem.pipeline.period_ms)
         for table_id, table in tables.items()
@@ -243,8 +243,8 @@ def processes_of(
     pipeline, fabric = problem.pipeline, problem.fabric
     rates, sent = pipeline.rates, dict.fromkeys(fabric.links, 1)
     for flow, placement in itertools.product(pipeline.flows, problem.candidates.values()):
-        link = f"{placement[flow.source]}->{placement[flow.target]}"
-        sent[link] = max(sent.get(link, 1), pipeline.message_rate(flow))
+        crossed = f"{placement[flow.source]}->{placement[flow.target]}"
+        sent[crossed] = max(sent.get(crossed, 1), pipeline.message_rate(flow))
     yield frozenset(fabric.nodes), pipeline.release_jitter_ms, 1
     for name, scale in pipeline.scales.items():
         scaled = [task.on for task in pipeline.tasks.values() if task.scale == name]

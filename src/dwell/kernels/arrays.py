@@ -259,7 +259,9 @@ class CellArrays:
         own = slice(part.row, part.row + part.rows), slice(part.cycles)
         tasks = *own, slice(part.tasks)
         log, outcome = whole.log.reshape(shape), whole.log_outcome.reshape(shape)
-        arrived, taken = (table.reshape(shape)[own] for table in (whole.log_arrived, whole.log_taken))
+        arrived, taken = (
+            table.reshape(shape)[own] for table in (whole.log_arrived, whole.log_taken)
+        )
         return JobLogs(log[tasks], outcome[tasks], arrived, taken)
 
 
@@ -545,7 +547,11 @@ class _Layout:
             self.back_ns.append(back_ns(problem, placement))
 
     def _add_forwards(
-        self, problem: Problem, real: Realisation, hop_0: int, site_row: Mapping[tuple[str, str], int]
+        self,
+        problem: Problem,
+        real: Realisation,
+        hop_0: int,
+        site_row: Mapping[tuple[str, str], int],
     ) -> None:
         """Add the forwards of sampled messages; their hops follow the hops of flows."""
         ends = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
@@ -707,7 +713,7 @@ class _Layout:
 
     def _most_messages(self) -> int:
         """Largest number of flows of a cell, and of forwards of its sampled flows."""
-        return self.max_flows + max(row["n_forwards"] for row in self.rows["cells"])
+        return self.max_flows + max(len(real.forwards) for _, real in self.cells)
 
     def _foreign(self, server: Mapping[str, Any], changes: Rows) -> int:
         """Largest number of a server's foreign threads that take turns; 0 without turns."""

@@ -218,9 +218,8 @@ template <class S>
 i32 sent_by(const S& s, i64 cell, i64 cycle, const Task& from) {
   if (!S::kRates) return from.n_out;
   const i32* flows = &s.outputs[from.out_0];
-  return static_cast<i32>(std::count_if(flows, flows + from.n_out, [&](i32 flow) {
-    return s.is_due(s.flow(cell, flow), cycle);
-  }));
+  return static_cast<i32>(std::count_if(
+      flows, flows + from.n_out, [&](i32 flow) { return s.is_due(s.flow(cell, flow), cycle); }));
 }
 
 // Hands a job's outputs over to tasks on its node, and sends the others.

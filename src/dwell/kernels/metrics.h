@@ -48,7 +48,11 @@ template <class S>
   const i64 l95_ns = ages[rank - 1];
   const f64 l95_ms = static_cast<f64>(l95_ns) / 1e6;
   const bool lost = unfinished > counted - rank && is_age(s, cell, first, n, rank, l95_ns, now);
-  return Seen{first, n, missed, counted, std::min(l95_ms, of.longest_ms),
+  return Seen{first,
+              n,
+              missed,
+              counted,
+              std::min(l95_ms, of.longest_ms),
               lost ? std::numeric_limits<f64>::infinity() : l95_ms};
 }
 

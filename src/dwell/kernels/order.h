@@ -11,7 +11,8 @@ namespace dwell {
 // The arrival of a held message that is being repeated.
 constexpr i64 kUnknown = -1;
 
-// What a cycle has lost: nothing; only jobs and messages that its sinks do not need; or its outcome.
+// What a cycle has lost: nothing; only jobs and messages that its sinks do not need; or its
+// outcome.
 enum Loss : i8 { kNothing, kUnneeded, kOutcome };
 
 // Whether waited flows lead from a task to a sink that runs in a cycle.
@@ -57,7 +58,8 @@ bool is_given_up(const S& s, i64 cell, i64 cycle) {
   return cycle + parent.given_up_after < parent.released;
 }
 
-// Whether the item of an arrival, or of a repeat, is a forward: after all flows, lost ones included.
+// Whether the item of an arrival, or of a repeat, is a forward: after all flows, lost ones
+// included.
 template <class S>
 bool is_forward(const S& s, i64 item) {
   return S::kRates && item >= kLostOnLink + s.n_flows;

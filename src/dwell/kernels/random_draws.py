@@ -679,7 +679,7 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
 
 
 def _forwards(problem: Problem) -> Iterator[tuple[str, str, str]]:
-    """Yield the sampled flows with the links between nodes of their targets, by flow, then by link."""
+    """Yield sampled flows with the links between nodes of their targets, by flow, then by link."""
     for flow in problem.pipeline.flows:
         if not flow.sampled:
             continue

@@ -194,8 +194,8 @@ class Realisation:
     sites : tuple of (task, node)
         Rows of `exec_ns`.
     exec_ns : int64 array, shape (sites, N)
-        Execution time of each cycle's job, scale included; 0 in cycles in which the task is not due.
-        The same holds for delays.
+        Execution time of each cycle's job, scale included; 0 in cycles in which the task is not
+        due. The same holds for delays.
     hops : tuple of (source task, target task, link)
         Rows of `delay_ns` and `loss_keys`: a flow and a link that it uses in some candidate.
     delay_ns : int64 array, shape (hops, N)

@@ -132,9 +132,8 @@ void take_values(S& s, i64 key) {
 template <class S>
 i32 sampled_outputs(const S& s, i64 cell, const Task& from) {
   const i32* flows = &s.outputs[from.out_0];
-  return static_cast<i32>(std::count_if(flows, flows + from.n_out, [&](i32 flow) {
-    return s.flow(cell, flow).is_sampled != 0;
-  }));
+  return static_cast<i32>(std::count_if(
+      flows, flows + from.n_out, [&](i32 flow) { return s.flow(cell, flow).is_sampled != 0; }));
 }
 
 }  // namespace dwell

@@ -22,7 +22,6 @@ from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Tier
 from dwell.model.pipeline import Flow, Task
-from dwell.model.task_rates import rate_faults
 from dwell.model.scenario import (
     MAX_LAYERS,
     RAMP_LAYERS,
@@ -30,6 +29,7 @@ from dwell.model.scenario import (
     LinkDisturbance,
     NodeDisturbance,
 )
+from dwell.model.task_rates import rate_faults
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -230,8 +230,8 @@ def _tasks(parts: CellParts) -> Iterator[Fault]:
         if task.offset_ms and name in targets:
             yield Fault(
                 f"{path}.offset_ms",
-                f"{task.offset_ms:g} on a task that waits for inputs; only a task without waited inputs "
-                "has an offset: remove it",
+                f"{task.offset_ms:g} on a task that waits for inputs; only a task without waited "
+                "inputs has an offset: remove it",
             )
         for node_name, execution in task.on.items():
             yield from _unknown(f"{path}.on.{node_name}", "node", node_name, parts.nodes)

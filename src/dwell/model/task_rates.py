@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from graphlib import TopologicalSorter
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
@@ -56,7 +57,7 @@ def _bad_join(every: int | None, inputs: Mapping[str, int]) -> str:
     fast, slow = inputs[fastest], inputs[slowest]
     sampled = f"mark the flow from {slowest} with `sampled: true`"
     known = sorted({*inputs.values()})
-    if any(later % first for first, later in zip(known, known[1:], strict=False)):
+    if any(later % first for first, later in pairwise(known)):
         names = " and ".join(f"{name} (every {rate})" for name, rate in inputs.items())
         return f"it waits for {names}, and no rate is a multiple of the other; {sampled}"
     if every is None and fast != slow:
@@ -72,7 +73,7 @@ def _bad_join(every: int | None, inputs: Mapping[str, int]) -> str:
     return ""
 
 
-def _ordered(tasks: Iterable[str], flows: Iterable[Flow]) -> Iterator[str]:
+def _ordered(tasks: Iterable[str], flows: Iterable[Flow]) -> Iterable[str]:
     graph: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(tasks, ()))
     for flow in flows:
         graph.add(flow.target, flow.source)

@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms, moved_shares, seen_costs
-from dwell.kernels.arrays import CellArrays, flow_rows
+from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
@@ -138,10 +138,9 @@ class PlayedRealisation:
 
     def share_of(self, cycles: NDArray[np.bool_]) -> Floats:
         """Return the share of each window's cycles that are true, without idle cycles."""
-        if self.idle is None:
-            return self.by_window(cycles).mean(axis=1)
-        share: Floats = self.by_window(cycles).sum(axis=1) / self.seen["counted"]
-        return share
+        windows = self.by_window(cycles)
+        share: Floats = windows.mean(axis=1)
+        return share if self.idle is None else windows.sum(axis=1) / self.seen["counted"]
 
     @cached_property
     def missed(self) -> NDArray[np.bool_]:
@@ -399,7 +398,7 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
     cells = len(tables.cells)
-    log, outcome, _, taken = played.arrays.logs()
+    log, outcome, *_ = played.arrays.logs()
     # The sites of a shadow follow the sites of its cell, in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
     site = tables.site_of - played.arrays.part.site_0
