@@ -23,7 +23,7 @@ class Chain:
     source: str = key("Task from whose releases the age counts.", named="from")
     target: str = key("Task behind it, whose completions are the actuations.", named="to")
     max_age_ms: float = key(
-        "Age at an actuation beyond which its cycle is missed, ms.",
+        "Age beyond which an actuation counts in `age_missed_<chain>`, ms.",
         MAX_AGE_MS,
         default=math.inf,
         usual="none",
