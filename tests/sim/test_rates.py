@@ -248,7 +248,7 @@ def test_a_node_forwards_its_value_when_the_target_moves() -> None:
 
 
 def test_what_arrives_at_an_old_node_is_forwarded_until_the_first_new_message() -> None:
-    # The detection of cycle 20 is sent to E, under FAR, and ends at 243 ms; control moves at 230 ms.
+    # The detection of cycle 20 is sent to E, under FAR, and ends at 243 ms; the move is at 230 ms.
     stamps = [1] * 23 + [0] * 17
     taken = taken_by_control(moving(), stamps)
     # It arrives on R at 245 ms: control takes it from cycle 25 on, at 251 ms.

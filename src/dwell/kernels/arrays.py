@@ -810,6 +810,7 @@ class _Layout:
             "log": _as_rows("log", np.full((logged * self.max_tasks, 6), -1)),
             "log_arrived": np.full((logged, self.max_flows), -1),
             "log_taken": np.full((logged if clock["has_rates"] else 0, self.max_flows), -1),
+            "forwarded": np.full(len(rows["forwards"]), -1),
             "values": np.full((len(rows["sites"]) * clock["has_rates"], self.max_flows), -1),
             "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
             "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),

@@ -364,6 +364,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
   table(f64, own_ns) table(i64, soonest_ns) table(i64, ages) table(i64, values)                  \
+  table(i64, forwarded)                                                                          \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \

@@ -133,6 +133,7 @@ class Tables(NamedTuple):
     soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 if unknown
     ages: Ints  # (W,) scratch: latency, or age if unfinished, of the cycles of a window
     values: Ints  # (sites, flows) cycle of the newest message of a sampled input; -1 for none
+    forwarded: Ints  # (forwards,) newest cycle that was forwarded; -1 for none
     rule: Rows  # (1,), or empty if Python decides
     options: Rows  # (candidates,)
     shown: Floats  # (resources, candidates) last share under a candidate, kept while full; else 1

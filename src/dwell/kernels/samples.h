@@ -55,7 +55,7 @@ void send_forward(S& s, i64 key, i64 attempt, i64 now) {
   }
 }
 
-// Forwards the value of a site to another site, unless that has it or a newer one.
+// Forwards the value of a site to another site, unless that has it or a newer one, or was sent one.
 template <class S>
 void forward(S& s, i64 cell, i64 flow, i64 from_site, i64 to_site, i64 now) {
   const i64 cycle = value_of(s, from_site, flow);
@@ -64,6 +64,9 @@ void forward(S& s, i64 cell, i64 flow, i64 from_site, i64 to_site, i64 now) {
   for (i64 number = 0; number < of.n_forwards; ++number) {
     const Forward& row = s.forwards[of.forward_0 + number];
     if (row.flow != flow || row.from_site != from_site || row.to_site != to_site) continue;
+    i64& forwarded = s.forwarded[of.forward_0 + number];
+    if (forwarded >= cycle) return;
+    forwarded = cycle;
     send_forward(s, make_key(kArrival, cell, cycle, kLostOnLink + s.n_flows + number), 0, now);
     return;
   }
