@@ -334,15 +334,16 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
 
 
 def _require_one_rate(problem: Problem) -> None:
-    """Raise a LiveError if a task has a rate of its own, or a flow is sampled."""
+    """Raise a LiveError if a task has a rate of its own, a flow is sampled, or a chain is given."""
     pipeline = problem.pipeline
     keys = [f"tasks.{name}.every" for name, task in pipeline.tasks.items() if task.every]
     keys += [f"flows[{i}].sampled" for i, flow in enumerate(pipeline.flows) if flow.sampled]
+    keys += [f"chains.{name}" for name in pipeline.chains]
     if keys:
         raise LiveError(
             "\n".join(
-                f"{key}: not supported in the live cell {problem.name}; only the simulator runs "
-                "tasks at several rates: remove it, or use dwell run"
+                f"{key}: not supported in the live cell {problem.name}; only the simulator has "
+                "several rates and chains: remove it, or use dwell run"
                 for key in keys
             )
         )
