@@ -386,7 +386,6 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
   if (is_shadow) {
     s.latency_ns[s.output(cell, cycle)] = 0;
   } else if (S::kRates) {
-    s.slot(cell, cycle).is_lost = kOutcome;
     s.outcome[s.output(cell, cycle)] = kIdle;
   }
 }
