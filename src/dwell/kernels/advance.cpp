@@ -15,6 +15,17 @@ Status advance(const Tables& tables) {
   return status;
 }
 
+template <bool has_rates>
+Status advance(const Tables& tables) {
+  const bool is_plain = tables.cells.size == 1 && tables.log.size == 0;
+  if (tables.quotas.size > 0) {
+    return is_plain ? advance<true, true, has_rates>(tables)
+                    : advance<true, false, has_rates>(tables);
+  }
+  return is_plain ? advance<false, true, has_rates>(tables)
+                  : advance<false, false, has_rates>(tables);
+}
+
 // Marks the instants of tasks and flows that do not run in a cycle as not due.
 template <class S>
 void mark_undue(const S& s, i64 cell, i64 cycle, i64 n_tasks, const i64* flows, i64 n_flows,
@@ -37,15 +48,8 @@ using namespace dwell;
 
 // Continues a simulation; returns a Status.
 DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
-  const bool has_quotas = tables->quotas.size > 0;
-  if (tables->clock[0].has_rates) {
-    return has_quotas ? advance<true, false, true>(*tables) : advance<false, false, true>(*tables);
-  }
-  const bool is_plain = tables->cells.size == 1 && tables->log.size == 0;
-  if (has_quotas) {
-    return is_plain ? advance<true, true, false>(*tables) : advance<true, false, false>(*tables);
-  }
-  return is_plain ? advance<false, true, false>(*tables) : advance<false, false, false>(*tables);
+  if (tables->clock[0].has_rates) return advance<true>(*tables);
+  return advance<false>(*tables);
 }
 
 // Adds an event of the caller; the queue must have room.

@@ -119,7 +119,7 @@ void move_values(S& s, i64 cell, i64 cycle, i64 now) {
 // Gives a job that a worker takes the values of its sampled inputs.
 template <class S>
 void take_values(S& s, i64 key) {
-  if (s.log.size == 0) return;
+  if (S::kPlain || s.log.size == 0) return;
   const i64 cell = cell_of(key), cycle = cycle_of(key), task = item_of(key);
   const Cell& of = s.cell(cell);
   if (of.parent >= 0) return;

@@ -51,7 +51,8 @@ struct Simulation : Tables {
   // Whether a task runs in a cycle, or a flow carries a message in it.
   template <class Row>
   static bool is_due(const Row& row, i64 cycle) {
-    return !kRates || cycle % row.every == 0;
+    // 32 bits hold every cycle, and their division is faster.
+    return !kRates || static_cast<u32>(cycle) % static_cast<u32>(row.every) == 0;
   }
 
   // Place of a cycle in the outputs.
