@@ -7,12 +7,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+import dwell
 from dwell import simulate
 from dwell.cellfile.cell import from_document
+from dwell.errors import SimulationError
 from dwell.estimators import warnings_of
+from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.measured import Site
-from dwell.estimators.presents import Present, realised
+from dwell.estimators.present import Present
 from dwell.estimators.prices import prices_of
+from dwell.kernels.arrays import CellArrays
 from dwell.kernels.random_draws import draw
 from dwell.model import Problem
 from dwell.study.summary import summarise
@@ -92,10 +96,10 @@ def test_a_run_of_a_slow_task_takes_the_measured_values_in_turn() -> None:
     problem = from_document(document())
     real = draw(problem, seed=1, windows=2)
     site = Site("detect", "E")
-    there = realised(problem, real, Present({site: np.array([1.0, 2.0, 3.0])}))
-    row = there.exec_ns[there.sites.index(tuple(site))]
-    assert row[::10].tolist() == [1_000_000 * (1 + k % 3) for k in range(8)]
-    assert not row.reshape(-1, 10)[:, 1:].any()
+    player = CandidatePlayer([(problem, real)], measures=True, log_jobs=True)
+    player.begin({0: Present({site: np.array([1.0, 2.0, 3.0])})})
+    jobs = CellArrays(player.play({0: "SO"})).logs().jobs[0, ::10, 2]
+    assert (jobs["end_ns"] - jobs["start_ns"]).tolist() == [1e6 * (1 + k % 3) for k in range(8)]
 
 
 def test_what_is_not_due_is_no_loss() -> None:
@@ -112,6 +116,11 @@ def test_the_controller_leaves_a_slow_node() -> None:
     problem = from_document(document(scenarios={"slow": slow}, controller={"initial": "ALL"}))
     run = simulate(problem, scenario="slow", policy="dtp", seed=1, windows=40)
     assert run.windows["placement"].to_list()[-1] != "ALL"
+
+
+def test_the_search_of_placements_refuses_rates() -> None:
+    with pytest.raises(SimulationError, match="every"):
+        dwell.search(from_document(document()), cycles=40)
 
 
 def warned(document: dict[str, Any]) -> list[str]:

@@ -264,6 +264,8 @@ class Drawing:
         Prefix of the names of the streams.
     shared, disturbances
         As in `draw`.
+    every_hop : bool
+        Whether to sample all hops that any placement can use, and not only those of candidates.
 
     Raises
     ------
@@ -283,6 +285,7 @@ class Drawing:
         streams: str = "",
         shared: Collection[str] = (),
         disturbances: Scenario = (),
+        every_hop: bool = False,
     ) -> None:
         self.problem, self.name, self.shared = problem, scenario, shared
         own = (item for item in problem.scenario(scenario) if not self._is_shared(item))
@@ -295,7 +298,7 @@ class Drawing:
         self.sent: Ints | None = None
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
-        self.hops = _hops(problem)
+        self.hops = tuple(_possible_hops(problem)) if every_hop else _hops(problem)
         #: Shadow jobs bring no values, so nothing of theirs is forwarded.
         self.forwards = () if shadow else tuple(_forwards(problem))
         #: Link of each hop and forward, with the prefix and the end of the names of its streams.
@@ -694,6 +697,15 @@ def _hop_rates(problem: Problem, hops: Sequence[tuple[str, str, str]]) -> list[i
     pipeline = problem.pipeline
     rates = {(one.source, one.target): pipeline.message_rate(one) for one in pipeline.flows}
     return [rates.get((source, target), 1) for source, target, _ in hops]
+
+
+def _possible_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    """Yield flows with the links that they can use in any placement, by flow, then by link."""
+    tasks = problem.pipeline.tasks
+    for flow in problem.pipeline.flows:
+        for link in problem.fabric.links.values():
+            if link.source in tasks[flow.source].on and link.target in tasks[flow.target].on:
+                yield flow.source, flow.target, link.name
 
 
 def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
