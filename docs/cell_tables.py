@@ -34,6 +34,7 @@ SHAPES = {
     "a task": cell_form.TASK,
     "an execution": cell_form.EXECUTION,
     "a flow": cell_form.FLOW,
+    "a chain": cell_form.CHAIN,
     "a disturbance": cell_form.DISTURBANCE,
     "the objective": cell_form.OBJECTIVE,
     "weights": cell_form.WEIGHTS,

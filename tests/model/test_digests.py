@@ -14,6 +14,7 @@ from dwell.errors import ProblemError
 from dwell.model import (
     Bursts,
     Caps,
+    Chain,
     ControllerSettings,
     Execution,
     Flow,
@@ -81,6 +82,7 @@ tasks:
     warmup_jobs: 3
   listen:
     "on": {R: {exec_ms: 1}}
+    every: 3
     ros2:
       topic: audio
       type: audio_msgs/msg/Audio
@@ -96,9 +98,11 @@ tasks:
 flows:
   - {from: see, to: think, bytes: 100}
   - {from: see, to: look}
-  - {from: listen, to: think}
+  - {from: listen, to: look, sampled: true}
+  - {from: see, to: act, sampled: true}
   - {from: think, to: act}
   - {from: look, to: act}
+chains: {see-act: {from: see, to: act, max_age_ms: 90}}
 candidates: {LOC: {think: R}, FAR: {think: E}}
 objective:
   weights: {latency: 1.5, violations: 2, robot: 0.6, edge: 0.4, switching: 0.3, cloud: 0.2}
@@ -170,9 +174,10 @@ WORDS = (
 )
 #: Kinds whose keys are in a live cell's file.
 KINDS = (
-    *(Bursts, Caps, ControllerSettings, Endpoint, Episodes, Execution, Flow, Host, Link),
-    *(LinkDisturbance, LiveSettings, MovingTarget, Node, NodeDisturbance, Objective, Pipeline),
-    *(Problem, Quota, RosActuator, RosCommands, RosTopic, Servo, Targets, Task, Weights),
+    *(Bursts, Caps, Chain, ControllerSettings, Endpoint, Episodes, Execution, Flow, Host),
+    *(Link, LinkDisturbance, LiveSettings, MovingTarget, Node, NodeDisturbance, Objective),
+    *(Pipeline, Problem, Quota, RosActuator, RosCommands, RosTopic, Servo, Targets, Task),
+    Weights,
 )
 #: Keys that cannot be changed alone: ends of links and flows, kinds of accelerators, what excludes
 #: a phase or goes with a damping, the only source of stamps.

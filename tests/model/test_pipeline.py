@@ -87,7 +87,7 @@ def test_of_the_chains_every_step_is_a_flow_and_every_flow_a_step(
     pairs: set[tuple[int, int]],
 ) -> None:
     flows = {("abcdefg"[low], "abcdefg"[high]) for low, high in pairs if low < high}
-    chains = pipeline(*sorted(flows), tasks="abcdefg").chains()
+    chains = pipeline(*sorted(flows), tasks="abcdefg").ways()
     steps = [step for chain in chains for step in itertools.pairwise(chain)]
     assert sorted(steps) == sorted(flows)
     assert {name for chain in chains for name in chain} == set("abcdefg")

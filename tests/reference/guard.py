@@ -6,6 +6,7 @@ them, and works out from them whether it fires, and where the cell goes.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -51,6 +52,8 @@ class Guard:
         self.in_a_row = settings.guard_cycles + 1
         self.stay = Stay(problem.initial, 0, by_guard=False, watched=0)
         self.released: list[int] = []
+        # Cycles in which a sink is due; it waits for these alone.
+        self.due: list[int] = []
         self.newest = -1
         # First cycle since its own node was down.
         self.restarted = 0
@@ -72,8 +75,11 @@ class Guard:
 
     # ------------------------------------------------------------------------- what it is told of
 
-    def release(self, cycle: int, now: int, active: str, other: str | None) -> None:
-        """Note that a cycle is released; with another placement an order takes effect."""
+    def release(self, cycle: int, now: int, active: str, other: str | None, *, due: bool) -> None:
+        """Note that a cycle is released; with another placement an order takes effect.
+
+        `due` says whether a sink is due in it.
+        """
         if active != self.stay.placement:
             if self.stay.by_guard:
                 carried = self.newest >= self.stay.first
@@ -83,7 +89,9 @@ class Guard:
             self.rests = 0
             self.begin_anew()
         self.released.append(now)
-        self.through[active].released[cycle] = now
+        if due:
+            self.due.append(cycle)
+            self.through[active].released[cycle] = now
         if other is not None:
             self.through[other].released[cycle] = now
 
@@ -119,8 +127,9 @@ class Guard:
 
     def fires(self, now: int) -> bool:
         """Whether the cycle that it waits for is as old as the patience."""
-        waited = max(self.newest + 1, self.stay.watched, self.restarted)
-        return waited < len(self.released) and self.released[waited] + self.patience <= now
+        first = max(self.newest + 1, self.stay.watched, self.restarted)
+        waited = self.due[bisect_left(self.due, first) :][:1]
+        return any(self.released[cycle] + self.patience <= now for cycle in waited)
 
     def failing(self, candidate: str, now: int) -> bool:
         """Whether the last g + 1 cycles or shadows through a candidate have failed."""

@@ -20,8 +20,9 @@ from typing import Any
 import simpy
 
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
-from dwell.model import Execution, Flow, Node, Pipeline, Placement, Problem, Quota, Task
+from dwell.model import Execution, Flow, Node, Placement, Problem, Quota, Task
 from tests.reference.guard import NEVER, Guard, Proof
+from tests.reference.rates import Rates
 
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000
@@ -39,6 +40,8 @@ LEAST_TURN_MS = 1.4
 GIVEN_UP_AFTER = 64
 # Behind all that an event does one after another.
 LATE = 10**9
+# Forwarded messages are handled behind all others of their cycle.
+BEHIND_TASKS = 800_000
 # Behind SimPy's own priorities, 0 and 1, and before every other event.
 EVENT_END = 2
 
@@ -73,7 +76,8 @@ class JobResult:
     """One execution of a task: it exists from the instant at which all its inputs are there.
 
     `end_ns` is its completion, or the instant at which it was lost. `core` is the core time that it
-    has received, nanoseconds; of one on an accelerator, the time that it has had its place.
+    has received, nanoseconds; of one on an accelerator, the time that it has had its place. `taken`
+    are the cycles of the values that it got of sampled inputs, by their sources.
     """
 
     node: str
@@ -82,6 +86,7 @@ class JobResult:
     end_ns: int | None
     outcome: str
     core: Fraction
+    taken: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -201,16 +206,6 @@ def nanoseconds(ms: float) -> int:
     return round(ms * 1e6)
 
 
-def apart(pipeline: Pipeline, active: Placement, other: Placement) -> set[str]:
-    """Return the tasks that run on another node under `other`, or behind such a task."""
-
-    def is_apart(task: str) -> bool:
-        before = (flow.source for flow in pipeline.inputs(task))
-        return active[task] != other[task] or any(is_apart(source) for source in before)
-
-    return {task for task in pipeline.tasks if is_apart(task)}
-
-
 def shadow_stamp(cycle: int, active: str, names: Sequence[str], fraction: float) -> str | None:
     """Return the candidate that a cycle under `active` is also sent through, if any."""
     if fraction <= 0:
@@ -247,6 +242,7 @@ class Job:
     outcome: str = "in_flight"
     cores: int = 0
     due: int | None = None
+    taken: dict[str, int] = field(default_factory=dict)
 
     @property
     def readiness(self) -> tuple[int, int, int, int]:
@@ -254,7 +250,10 @@ class Job:
 
     @property
     def result(self) -> JobResult:
-        return JobResult(self.node, self.ready, self.start, self.end, self.outcome, self.core)
+        return JobResult(
+            *(self.node, self.ready, self.start, self.end, self.outcome, self.core),
+            dict(self.taken),
+        )
 
 
 @dataclass(eq=False)
@@ -270,24 +269,37 @@ class Thread:
         return self.received, self.job.readiness if self.job else (2**62,)
 
 
+@dataclass(frozen=True)
+class Draws:
+    """Delays of one hop, its extra delays by layer, and the stream of its losses."""
+
+    delay_ns: Sequence[int]
+    extra_ns: Mapping[int, Sequence[int]]
+    loss_key: int
+
+
 @dataclass(eq=False)
 class Message:
-    """What crosses a link: an output of a job, or the state of a task that moves.
+    """What crosses a link: an output, a forwarded value, or the state of a task that moves.
 
-    `arrive` is what happens when it does. The draws of state are those of `cycle`, too. `flow` is
-    its place in the file, which orders what is for the same job at the same instant. `arrival` is
-    when it would arrive if it waited for no other message, and the event from which that follows.
+    `arrive` is what happens when it does. Its draws are those of `cycle`. `task` and `flow` order
+    it among the messages of its cycle. `arrival` is when it would arrive if it waited for no other
+    message, and the event from which that follows. `is_needed` says whether its loss names the
+    outcome of its cycle.
     """
 
     cell: int
     cycle: int
     target: str
     payload_bytes: int
-    hop: int
+    draws: Draws
     arrive: Callable[[], None]
     sent_at: int
     sent_by: int
+    task: int
     flow: int = 0
+    is_needed: bool = True
+    is_forward: bool = False
     is_state: bool = False
     migration: int = 0
     attempt: int = 0
@@ -771,8 +783,7 @@ class Simulation:
         self.number = real.cycles
         self.end = self.close_of(self.number)
         self.index = {task: i for i, task in enumerate(self.pipeline.tasks)}
-        self.sources = [task for task in self.pipeline.tasks if not self.pipeline.inputs(task)]
-        self.sinks = [task for task in self.pipeline.tasks if not self.pipeline.outputs(task)]
+        self.rates = Rates(self.pipeline)
 
         self.given = given
         self.script = list(script)
@@ -824,6 +835,12 @@ class Simulation:
         self.placed: dict[tuple[int, int], Placement] = {}
         self.apart: dict[int, set[str]] = {}
         self.losses: dict[tuple[int, int], list[tuple[int, int, str]]] = {}
+        # Cycles of which anything is lost, needed or not.
+        self.flawed: set[tuple[int, int]] = set()
+        # Newest cycle that a node has of a sampled flow, by the flow's place and the node.
+        self.values: dict[tuple[int, str], int] = {}
+        # Newest cycle that has been forwarded of it over a link.
+        self.forwarded: dict[tuple[int, str], int] = {}
         self.inputs: dict[tuple[int, int, str], list[tuple[int, Job]]] = {}
         self.lost_joins: set[tuple[int, int, str]] = set()
         self.jobs: dict[tuple[int, int, str], Job] = {}
@@ -934,10 +951,13 @@ class Simulation:
             for cycle, (active, _) in enumerate(self.stamps):
                 for task in on_it(cycle, kind):
                     due = self.release[cycle] + self.soonest.get((active, task), 0)
-                    if cycle == len(self.stamps) - 1 and due + period < end:
+                    follows = cycle == len(self.stamps) - 1 and self.rates.is_due(task, cycle + 1)
+                    if follows and due + period < end:
                         return True
+                    if not self.rates.is_due(task, cycle):
+                        continue
                     missing = (ITSELF, cycle, task) not in self.jobs
-                    lost = (ITSELF, cycle) in self.losses
+                    lost = (ITSELF, cycle) in self.flawed
                     if missing and not lost and due < end and self.now < due + period:
                         return True
             return False
@@ -1212,10 +1232,11 @@ class Simulation:
                     boundary,
                     task,
                     payload,
-                    self.reals[ITSELF].hops.index((task, task, link)),
+                    self.draws(ITSELF, self.reals[ITSELF].hops.index((task, task, link))),
                     lambda: be_ready(task),
                     self.now,
                     self.current,
+                    self.index[task],
                     is_state=True,
                     migration=number,
                 ),
@@ -1318,7 +1339,7 @@ class Simulation:
             return
         if self.is_given_up(cell, cycle):
             return
-        if not all(self.reached(cell, cycle, sink) for sink in self.sinks):
+        if not self.counts(cell, cycle) or not self.is_complete(cell, cycle):
             return
         self.heard_of.add((cell, cycle))
         back = way_back(self.problem, self.placed[cell, cycle])
@@ -1343,6 +1364,27 @@ class Simulation:
         first, wish = self.wishes[-1] if self.wishes else (0, None)
         return wish is not None and first <= cycle
 
+    def counts(self, cell: int, cycle: int) -> bool:
+        """Whether the guard counts a cycle (a sink is due), or a shadow (a task apart is due)."""
+        if cell == ITSELF:
+            return bool(self.rates.due_sinks(cycle))
+        away = self.apart[cycle]
+        return not away or any(self.rates.is_due(task, cycle) for task in away)
+
+    def is_complete(self, cell: int, cycle: int) -> bool:
+        """Whether a cycle is done, or all messages of a shadow have been handed over."""
+        sinks = self.rates.due_sinks(cycle)
+        return all(self.reached(cell, cycle, sink) for sink in sinks) and all(
+            (SHADOW, cycle, flow.source, flow.target) in self.arrived
+            for flow in self.pipeline.flows
+            if cell == SHADOW and flow.sampled and self.is_shadowed(flow.source, cycle)
+        )
+
+    def is_shadowed(self, task: str, cycle: int) -> bool:
+        """Whether the shadow of a cycle has a job of a task."""
+        away = task in self.apart[cycle] and task not in self.rates.sinks
+        return away and self.rates.is_due(task, cycle)
+
     def reached(self, cell: int, cycle: int, sink: str) -> bool:
         """Whether a sink has completed, or has all inputs that a shadow stops with."""
         if cell == ITSELF or sink not in self.apart[cycle]:
@@ -1350,7 +1392,7 @@ class Simulation:
             return job is not None and job.outcome == "done"
         return all(
             (SHADOW, cycle, flow.source, sink) in self.arrived
-            for flow in self.pipeline.inputs(sink)
+            for flow in self.rates.waited_inputs(sink)
         )
 
     # ---------------------------------------------------------------------------------- cycles
@@ -1375,27 +1417,40 @@ class Simulation:
             active, other = self.stamp(cycle)
             self.stamps.append((active, other))
             self.placed[ITSELF, cycle] = self.problem.candidates[active]
+            if other is not None:
+                self.placed[SHADOW, cycle] = self.problem.candidates[other]
+                self.apart[cycle] = self.rates.apart(
+                    self.placed[ITSELF, cycle], self.placed[SHADOW, cycle]
+                )
+            self.move_values(cycle)
             if self.guard is not None:
-                self.guard.release(cycle, self.now, active, other)
-                if self.is_probe(cycle):
-                    self.proof.released[cycle] = self.now
-            for name in self.sources:
+                self.tell_guard(cycle, active, other)
+            for name in self.rates.sources:
+                if not self.rates.is_due(name, cycle):
+                    continue
                 offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
                 if offset == 0:
                     self.start_source(ITSELF, cycle, name)
                 else:
                     self.start_later(ITSELF, cycle, name, offset)
             if other is not None:
-                self.release_shadow(cycle, self.problem.candidates[other])
+                self.release_shadow(cycle)
 
         return release
 
-    def release_shadow(self, cycle: int, other: Placement) -> None:
+    def tell_guard(self, cycle: int, active: str, other: str | None) -> None:
+        """Let the guard know of a cycle, and of its shadow, if they count."""
+        assert self.guard is not None
+        through = other if other is not None and self.counts(SHADOW, cycle) else None
+        due = self.counts(ITSELF, cycle)
+        self.guard.release(cycle, self.now, active, through, due=due)
+        if self.is_probe(cycle) and through is not None:
+            self.proof.released[cycle] = self.now
+
+    def release_shadow(self, cycle: int) -> None:
         """Release the shadow of a cycle: sources that run elsewhere are started a second time."""
-        self.placed[SHADOW, cycle] = other
-        self.apart[cycle] = apart(self.pipeline, self.placed[ITSELF, cycle], other)
-        for name in self.sources:
-            if name in self.apart[cycle] and name not in self.sinks:
+        for name in self.rates.sources:
+            if self.is_shadowed(name, cycle):
                 offset = nanoseconds(self.pipeline.tasks[name].offset_ms)
                 self.start_later(SHADOW, cycle, name, offset)
         self.hear_back(SHADOW, cycle)
@@ -1448,42 +1503,61 @@ class Simulation:
             self.queue_up(job)
 
     def lose(
-        self, cell: int, cycle: int, outcome: str, since: tuple[int, int] | None = None
+        self,
+        cell: int,
+        cycle: int,
+        outcome: str,
+        since: tuple[int, int] | None = None,
+        *,
+        is_needed: bool = True,
     ) -> None:
         """Something of a cycle is lost, now or since an event; the first loss names its outcome."""
-        event, number = since or (self.current, next(self.numbers))
-        self.losses.setdefault((cell, cycle), []).append((event, number, outcome))
+        self.flawed.add((cell, cycle))
+        if is_needed:
+            event, number = since or (self.current, next(self.numbers))
+            self.losses.setdefault((cell, cycle), []).append((event, number, outcome))
+
+    def lose_message(
+        self, message: Message, outcome: str, since: tuple[int, int] | None = None
+    ) -> None:
+        """Lose a message for ever; state and forwarded values belong to no cycle."""
+        if not message.is_state and not message.is_forward:
+            needed = message.is_needed
+            self.lose(message.cell, message.cycle, outcome, since, is_needed=needed)
 
     def lose_job(self, job: Job, outcome: str) -> None:
         job.outcome = outcome
         job.end = self.now
         # A job that an output makes ready takes another's place when all outputs have been sent.
         late = (self.current, LATE) if outcome == "replaced" else None
-        self.lose(job.cell, job.cycle, outcome, late)
+        needed = self.rates.is_needed(job.task.name, job.cycle)
+        self.lose(job.cell, job.cycle, outcome, late, is_needed=needed)
 
     def drop(self, message: Message, begun: int) -> None:
         """Lose a message on its link, in the event that sends it or else as an arrival."""
         if message.sent_at == self.now:
-            self.lose(message.cell, message.cycle, "dropped", message.sent)
+            self.lose_message(message, "dropped", message.sent)
             return
         self.at(
             self.now,
             ARRIVAL,
             message.cycle,
-            self.index[message.target],
-            lambda: self.lose(message.cell, message.cycle, "dropped"),
+            message.task,
+            lambda: self.lose_message(message, "dropped"),
             cell=message.cell,
             flow=message.flow,
             cause=begun,
         )
 
     def cycle_result(self, cycle: int) -> CycleResult:
-        if (ITSELF, cycle) in self.losses:
-            return CycleResult(min(self.losses[ITSELF, cycle])[-1])
-        sinks = [self.jobs.get((ITSELF, cycle, name)) for name in self.sinks]
+        due = self.rates.due_sinks(cycle)
+        if not due:
+            return CycleResult("idle")
+        sinks = [self.jobs.get((ITSELF, cycle, name)) for name in due]
         done = [job for job in sinks if job is not None and job.outcome == "done"]
-        if len(done) < len(self.sinks):
-            return CycleResult("in_flight")
+        if len(done) < len(due):
+            lost = self.losses.get((ITSELF, cycle))
+            return CycleResult(min(lost)[-1] if lost else "in_flight")
         end = max(self.end_of(job) for job in done)
         splits = {
             split for job in done if job.end == end for split in self.splits(job, Split(0, 0, 0))
@@ -1516,22 +1590,29 @@ class Simulation:
         key = (cell, cycle, task)
         if self.is_given_up(cell, cycle):
             return
-        if self.nodes[self.placed[cell, cycle][task]].down:
-            self.lost_joins.add(key)
-            self.lose(cell, cycle, "node_down")
+        node = self.placed[cell, cycle][task]
+        if self.nodes[node].down:
+            needed = not flow.sampled and self.rates.is_needed(task, cycle)
+            self.lose(cell, cycle, "node_down", is_needed=needed)
+            if not flow.sampled:
+                self.lost_joins.add(key)
             return
         self.arrived[cell, cycle, flow.source, flow.target] = self.now
         if cell == SHADOW:
             self.hear_back(SHADOW, cycle)
+        if flow.sampled:
+            if cell == ITSELF:
+                self.keep_value(flow, node, cycle)
+            return
         if key in self.lost_joins:
             return
         there = self.inputs.setdefault(key, [])
         there.append((self.now, sender))
-        if len(there) == len(self.pipeline.inputs(task)):
+        if len(there) == len(self.rates.waited_inputs(task)):
             del self.inputs[key]
             last = tuple(job for arrival, job in there if arrival == self.now)
             # A shadow stops before the sinks.
-            if cell == ITSELF or task not in self.sinks:
+            if cell == ITSELF or task not in self.rates.sinks:
                 self.queue_up(self.make_job(cell, cycle, task, last))
 
     def make_job(self, cell: int, cycle: int, name: str, senders: tuple[Job, ...]) -> Job:
@@ -1571,6 +1652,7 @@ class Simulation:
         while pool.idle > 0 and pool.waiting:
             pool.idle -= 1
             job = pool.waiting.pop(0)
+            self.take_values(job)
             self.nodes[node].runnable(job).append(job)
             self.looked_at(job)
 
@@ -1582,15 +1664,20 @@ class Simulation:
         pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
-        for flow in self.pipeline.outputs(job.task.name):
+        outputs = [
+            flow
+            for flow in self.pipeline.outputs(job.task.name)
+            if self.rates.carries(flow, job.cycle)
+        ]
+        for flow in outputs:
             self.send_output(job.cell, flow, job)
         if job.cell == ITSELF and (SHADOW, job.cycle) in self.placed:
             # Where the shadow shares the job, its outputs go to what it does not share, too.
             away = self.apart[job.cycle]
-            for flow in self.pipeline.outputs(job.task.name):
-                if job.task.name not in away and flow.target in away:
+            for flow in outputs:
+                if not flow.sampled and job.task.name not in away and flow.target in away:
                     self.send_output(SHADOW, flow, job)
-        if job.cell == ITSELF and job.task.name in self.sinks:
+        if job.cell == ITSELF and job.task.name in self.rates.sinks:
             self.hear_back(ITSELF, job.cycle)
             self.hear_back(SHADOW, job.cycle)
 
@@ -1611,11 +1698,80 @@ class Simulation:
                 cycle,
                 flow.target,
                 flow.payload_bytes,
-                self.reals[cell].hops.index((flow.source, flow.target, link)),
+                self.draws(cell, self.reals[cell].hops.index((flow.source, flow.target, link))),
                 lambda: self.deliver(cell, cycle, flow, job),
                 self.now,
                 self.current,
+                self.index[flow.target],
                 flow=self.pipeline.flows.index(flow),
+                is_needed=not flow.sampled and self.rates.is_needed(flow.target, cycle),
+            ),
+        )
+
+    def draws(self, cell: int, row: int) -> Draws:
+        """Return the draws of a flow, of state, or of forwarded values on a link."""
+        real = self.reals[cell]
+        layers = {layer: real.extra_ns[i] for i, (of, layer) in enumerate(real.layers) if of == row}
+        return Draws(real.delay_ns[row], layers, int(real.loss_keys[row]))
+
+    # --------------------------------------------------------------------------- sampled flows
+
+    def take_values(self, job: Job) -> None:
+        """Let a job get the values of its sampled inputs; a shadow runs on its cycle's."""
+        for flow in self.rates.sampled_inputs(job.task.name):
+            value = self.values.get((self.pipeline.flows.index(flow), job.node))
+            if value is not None and job.cell == ITSELF:
+                job.taken[flow.source] = value
+
+    def keep_value(self, flow: Flow, node: str, cycle: int) -> None:
+        """Keep a message that arrives, unless it is overtaken; forward it to the flow's place."""
+        key = self.pipeline.flows.index(flow), node
+        if cycle <= self.values.get(key, -1):
+            return
+        self.values[key] = cycle
+        place = self.placed[ITSELF, len(self.stamps) - 1][flow.target]
+        if place != node:
+            self.forward(flow, node, place)
+
+    def move_values(self, cycle: int) -> None:
+        """Let the old places of sampled flows forward their values to the new places."""
+        if cycle == 0:
+            return
+        before, after = self.placed[ITSELF, cycle - 1], self.placed[ITSELF, cycle]
+        for flow in self.pipeline.flows:
+            if flow.sampled and before[flow.target] != after[flow.target]:
+                self.forward(flow, before[flow.target], after[flow.target])
+
+    def forward(self, flow: Flow, node: str, place: str) -> None:
+        """Forward the value of a node to the place of a flow, if that is newer."""
+        number = self.pipeline.flows.index(flow)
+        cycle = self.values.get((number, node), -1)
+        link = f"{node}->{place}"
+        known = max(self.values.get((number, place), -1), self.forwarded.get((number, link), -1))
+        if cycle <= known or link not in self.problem.fabric.links:
+            return
+        self.forwarded[number, link] = cycle
+
+        def arrive() -> None:
+            if not self.nodes[place].down:
+                self.keep_value(flow, place, cycle)
+
+        real, hop = self.reals[ITSELF], (flow.source, flow.target, link)
+        links = list(self.problem.fabric.links)
+        self.send(
+            link,
+            Message(
+                ITSELF,
+                cycle,
+                flow.target,
+                flow.payload_bytes,
+                self.draws(ITSELF, len(real.hops) + real.forwards.index(hop)),
+                arrive,
+                self.now,
+                self.current,
+                BEHIND_TASKS,
+                flow=number * len(links) + links.index(link),
+                is_forward=True,
             ),
         )
 
@@ -1658,7 +1814,9 @@ class Simulation:
             if self.placed[cell, cycle][task] == name:
                 del self.inputs[cell, cycle, task]
                 self.lost_joins.add((cell, cycle, task))
-                self.lose(cell, cycle, "node_down")
+                needed = self.rates.is_needed(task, cycle)
+                self.lose(cell, cycle, "node_down", is_needed=needed)
+        self.values = {key: value for key, value in self.values.items() if key[1] != name}
 
     def come_up(self, name: str) -> None:
         for (cell, task, site), pool in self.pools.items():
@@ -1708,8 +1866,7 @@ class Simulation:
                     begun = self.note(self.now, -1, fixed=True)
                     continue
                 # It waits for ever, and so do those behind it.
-                if not message.is_state:
-                    self.lose(message.cell, message.cycle, "in_flight", message.sent)
+                self.lose_message(message, "in_flight", message.sent)
                 self.lose_behind(name, message)
                 message = yield self.queues[name].get()
             state = self.state(name)
@@ -1719,7 +1876,7 @@ class Simulation:
             if link.in_order and message not in self.ordered[name]:
                 self.ordered[name].append(message)
             duration = transmission_ns(message.payload_bytes, state.rate_mbps)
-            key = int(self.reals[message.cell].loss_keys[message.hop])
+            key = message.draws.loss_key
             if attempt_uniform(key, message.cycle, message.attempt) >= state.loss:
                 self.propagate(name, message, state, duration, begun)
             elif link.retransmit_ms is None and not message.is_state:
@@ -1749,18 +1906,17 @@ class Simulation:
         """Lose the messages that wait for one that never arrives."""
         ordered = self.ordered[link]
         for other in ordered[ordered.index(message) + 1 :] if message in ordered else ():
-            if other.arrival is not None and not other.is_state:
-                self.lose(other.cell, other.cycle, "in_flight", message.sent)
+            if other.arrival is not None:
+                self.lose_message(other, "in_flight", message.sent)
 
     def propagate(
         self, link: str, message: Message, state: LinkSegment, duration: int, begun: int
     ) -> None:
         """Let a transmission that begins now arrive."""
-        real = self.reals[message.cell]
-        delay = int(real.delay_ns[message.hop, message.cycle])
-        for row, (hop, layer) in enumerate(real.layers):
-            if hop == message.hop and layer in state.layers:
-                delay += int(real.extra_ns[row, message.cycle])
+        delay = int(message.draws.delay_ns[message.cycle])
+        for layer, extra_ns in message.draws.extra_ns.items():
+            if layer in state.layers:
+                delay += int(extra_ns[message.cycle])
         message.arrival = self.now + duration + delay, begun
         if self.problem.fabric.links[link].in_order:
             self.release_ordered(link)
@@ -1786,7 +1942,7 @@ class Simulation:
             arrival,
             ARRIVAL,
             message.cycle,
-            self.index[message.target],
+            message.task,
             message.arrive,
             cell=message.cell,
             flow=message.flow,
@@ -1808,15 +1964,14 @@ class Simulation:
             message.sent_at, message.sent_by = self.now, self.current
             self.send(link, message)
 
-        task = self.index[message.target]
         if message.is_state:
-            self.at(again, STEP, attempt, task, happen, cause=begun)
+            self.at(again, STEP, attempt, message.task, happen, cause=begun)
             return
         self.at(
             again,
             REPEAT,
             message.cycle,
-            task,
+            message.task,
             happen,
             cell=message.cell,
             flow=message.flow,

@@ -50,10 +50,12 @@ from tests.cells.generated import (
     random_problem,
     random_stamps,
 )
+from tests.cells.rated import with_rates
 from tests.kernels.parts import attempt_uniform as kernel_uniform
 from tests.reference import guard as reference_guard
 from tests.reference import simulator as reference_simulator
 from tests.reference.algorithm_1 import price, switching
+from tests.reference.rates import Rates
 from tests.reference.simulator import (
     ITSELF,
     NEAR_NS,
@@ -70,6 +72,8 @@ from tests.reference.simulator import (
     simulate,
 )
 
+# Instant of a job or a message of a cycle in which there is none.
+NOT_DUE = -2
 EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
 # Of the problems that take longer: those with shadows, and those in which orders take time.
 LONGER = int(os.environ.get("DWELL_EXAMPLES", "40"))
@@ -180,7 +184,8 @@ class Case:
 class Played:
     """What a run left behind; `arrived` by cell, cycle, source and target.
 
-    `work_ns` is the core time of jobs that are done, by cell, cycle and task.
+    `work_ns` is the core time of jobs that are done, by cell, cycle and task. `taken` are the
+    cycles of the values that jobs got, by cycle, source and target.
     """
 
     cycles: pl.DataFrame
@@ -191,6 +196,7 @@ class Played:
     arrived: Mapping[tuple[int, int, str, str], int] | None = None
     core_ns: NDArray[np.float64] | None = None
     work_ns: Mapping[tuple[int, int, str], int] | None = None
+    taken: Mapping[tuple[int, str, str], int] | None = None
 
 
 def make_case(
@@ -200,11 +206,15 @@ def make_case(
     whole_ms: bool = False,
     orders: bool = False,
     in_order: bool = False,
+    rates: bool = False,
+    idle: bool = True,
 ) -> Case:
     rng = Random(seed)
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
     if in_order:
         problem = with_order(problem, Random(seed), whole_ms=whole_ms)
+    if rates:
+        problem = with_rates(problem, Random(f"{seed} rates"), idle=idle)
     problem = with_deadline(problem, Random(f"{seed} deadline"), whole_ms=whole_ms)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
     names = tuple(random_stamps(rng, problem, windows))
@@ -224,11 +234,12 @@ def make_case(
 def deciding_often(case: Case, rng: Random) -> Case:
     """Let two cases in three decide more often than windows close, in windows of another length."""
     cycles = case.real.cycles
-    lengths = [w for w in range(2, LONGEST_WINDOW + 1) if cycles % w == 0 and cycles > w]
+    least = case.problem.pipeline.sink_cycles + 1
+    lengths = [w for w in range(least, LONGEST_WINDOW + 1) if cycles % w == 0 and cycles > w]
     if not lengths or rng.random() < 1 / 3:
         return case
     width = rng.choice(lengths)
-    every = rng.randint(1, width - 1)
+    every = rng.randint(least - 1, width - 1)
     problem = replace(
         case.problem,
         window_cycles=width,
@@ -286,9 +297,11 @@ def make_guarded(
     whole_ms: bool = False,
     orders: bool = False,
     in_order: bool = False,
+    rates: bool = False,
 ) -> Case:
     """Make a case whose cell has a guard."""
-    case = make_case(seed, schedulers, whole_ms=whole_ms, orders=orders, in_order=in_order)
+    of = {"whole_ms": whole_ms, "orders": orders, "in_order": in_order, "rates": rates}
+    case = make_case(seed, schedulers, **of, idle=False)
     rng = Random(seed)
     names = list(case.problem.candidates)
     settings = replace(
@@ -365,6 +378,8 @@ def differences(case: Case, found: Played, result: Result, tolerance_ns: int) ->
         yield from core_differences(case, found.core_ns, result)
     if found.work_ns is not None:
         yield from work_differences(found.work_ns, result)
+    if found.taken is not None:
+        yield from taken_differences(found.taken, result)
 
 
 def differs(found: int | None, expected: int | None, tolerance_ns: int) -> bool:
@@ -445,6 +460,18 @@ def arrival_differences(
             yield f"arrival {key}: {found}, expected {expected}"
 
 
+def taken_differences(taken: Mapping[tuple[int, str, str], int], result: Result) -> Iterator[str]:
+    """Compare the cycles of the values that jobs got."""
+    expected = {
+        (cycle, source, target): value
+        for (cycle, target), job in result.jobs.items()
+        for source, value in job.taken.items()
+    }
+    for key in sorted(taken.keys() | expected.keys()):
+        if taken.get(key) != expected.get(key):
+            yield f"value of {key}: {taken.get(key)}, expected {expected.get(key)}"
+
+
 def work_differences(work_ns: Mapping[tuple[int, int, str], int], result: Result) -> Iterator[str]:
     jobs = {(ITSELF, *key): job for key, job in result.jobs.items()}
     jobs |= {(SHADOW, *key): job for key, job in result.shadow_jobs.items()}
@@ -468,7 +495,7 @@ def window_differences(
             yield f"{where}: first_cycle {row['first_cycle']}, expected {first}"
         # Every deadline has passed at the close, so that nothing else is missed.
         deadline_ns = nanoseconds(case.problem.pipeline.deadline_ms)
-        latencies = [cycle.latency_ns for cycle in result.cycles[first:last]]
+        latencies = [c.latency_ns for c in result.cycles[first:last] if c.outcome != "idle"]
         missed = sum(ns is None or ns > deadline_ns for ns in latencies) / len(latencies)
         for column in ("violation_rate", "seen_violation_rate"):
             if row[column] not in (missed, None):
@@ -618,10 +645,11 @@ def seen_looks(case: Case, result: Result) -> list[Look]:
 
 def l95_ns_of(case: Case, first: int, count: int, closed: WindowResult | Look) -> int:
     """L95 of some cycles, as known at the close of a window or a decision."""
-    pipeline = case.problem.pipeline
-    sinks = [name for name in pipeline.tasks if not pipeline.outputs(name)]
-    seen = []
+    rates, seen = Rates(case.problem.pipeline), []
     for k in range(first, first + count):
+        sinks = rates.due_sinks(k)
+        if not sinks:
+            continue
         jobs = [closed.known.get((ITSELF, k, name)) for name in sinks]
         ends = [job.end_ns for job in jobs if job is not None and job.outcome == "done"]
         done = len(ends) == len(sinks)
@@ -666,7 +694,11 @@ def known_instants(
     """What evidence says, and what was known, for each kind of instants."""
     pipeline = case.problem.pipeline
     cycles = range(look.begin, look.last + 1)
-    ready, ended, started, work = np.full((4, len(cycles), len(pipeline.tasks)), -1)
+    rates = Rates(pipeline)
+    due = np.array(
+        [[cell == SHADOW or rates.is_due(task, k) for task in pipeline.tasks] for k in cycles]
+    )
+    ready, ended, started, work = (np.where(due, -1, NOT_DUE) for _ in range(4))
     for (whose, cycle, task), job in look.known.items():
         if whose == cell and cycle in cycles:
             row, column = cycle - look.begin, list(pipeline.tasks).index(task)
@@ -676,7 +708,13 @@ def known_instants(
             if job.outcome == "done" and job.end_ns is not None:
                 ended[row, column], work[row, column] = job.end_ns, round(job.core)
     arrived = [
-        [look.arrived.get((cell, k, f.source, f.target), -1) for f in pipeline.flows]
+        [
+            look.arrived.get(
+                (cell, k, f.source, f.target),
+                -1 if cell == SHADOW or rates.carries(f, k) else NOT_DUE,
+            )
+            for f in pipeline.flows
+        ]
         for k in cycles
     ]
     assert found.start_ns is not None
@@ -728,8 +766,8 @@ def play_stamped(
         return False
 
     metrics: list[tuple[float | None, ...]] = [
-        (l95_ms, missed / problem.window_cycles, None)
-        for _, _, missed, l95_ms, _ in arrays.tables.seen[0].tolist()
+        (l95_ms, missed / max(counted, 1), None)
+        for _, _, missed, counted, l95_ms, _ in arrays.tables.seen[0].tolist()
     ]
     tables, _ = make_tables(
         sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics, never),
@@ -751,8 +789,22 @@ def play_stamped(
         (cell, cycle, names[i]): int(work[cell, cycle, i])
         for cell, cycle, i in np.argwhere(work >= 0).tolist()
     }
+    sampled = [(i, flow) for i, flow in enumerate(ordered_flows(problem.pipeline)) if flow.sampled]
+    values = arrays.tables.log_taken.reshape(2, real.cycles, -1)[0] if sampled else np.empty((0, 0))
+    taken = {
+        (cycle, flow.source, flow.target): int(row[i])
+        for cycle, row in enumerate(values)
+        for i, flow in sampled
+        if row[i] >= 0
+    }
     cycles, jobs, windows = (tables[name]() for name in ("cycles", "jobs", "windows"))
-    return Played(cycles, jobs, windows, arrived=arrived, core_ns=core_ns, work_ns=work_ns)
+    return Played(
+        *(cycles, jobs, windows),
+        arrived=arrived,
+        core_ns=core_ns,
+        work_ns=work_ns,
+        taken=taken,
+    )
 
 
 def examine_stamped(seed: int, case: Case, tolerance_ns: int) -> list[str] | None:
@@ -786,6 +838,7 @@ def compare(
     guarded: bool = False,
     jitter: bool = False,
     in_order: bool = False,
+    rates: bool = False,
 ) -> None:
     excluded = 0
     failures: list[str] = []
@@ -794,7 +847,11 @@ def compare(
     seeds = range(few) if part == "few" else range(few, examples)
     for seed in seeds:
         make = make_guarded if guarded else make_case
-        case = make(seed, schedulers, whole_ms=whole_ms, orders=orders, in_order=in_order)
+        case = make(
+            *(seed, schedulers), whole_ms=whole_ms, orders=orders, in_order=in_order, rates=rates
+        )
+        if rates and not case.problem.pipeline.has_rates:
+            continue
         if jitter:
             case = jittered(case, Random(seed), whole_ms=whole_ms)
         found = (
@@ -803,10 +860,38 @@ def compare(
         if found is None:
             excluded += 1
         elif found:
-            how = f"whole_ms={whole_ms}, orders={orders}, jitter={jitter}, in_order={in_order}"
+            how = f"whole_ms={whole_ms}, orders={orders}, in_order={in_order}, rates={rates}"
             failures.append(f"{make.__name__}({seed}, {schedulers}, {how}): {found[:3]}")
     assert not failures, f"{len(failures)} of {len(seeds)} differ:\n" + "\n".join(failures[:10])
     assert excluded <= math.ceil(MOST_EXCLUDED * len(seeds))
+
+
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])
+@pytest.mark.parametrize("stamped", [False, True], ids=["decided", "stamped"])
+def test_several_rates_equal_to_the_nanosecond(part: str, stamped: bool, whole_ms: bool) -> None:
+    compare(part, ("fifo", "priority"), whole_ms=whole_ms, stamped=stamped, rates=True)
+
+
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])
+@pytest.mark.parametrize("stamped", [False, True], ids=["decided", "stamped"])
+def test_several_rates_under_orders_equal_to_the_nanosecond(
+    part: str, stamped: bool, whole_ms: bool
+) -> None:
+    how = {"whole_ms": whole_ms, "stamped": stamped, "orders": True, "in_order": whole_ms}
+    compare(part, ("fifo", "priority"), **how, rates=True)
+
+
+@pytest.mark.parametrize("jitter", [False, True], ids=["", "jitter"])
+def test_several_rates_with_a_guard_equal_to_the_nanosecond(part: str, jitter: bool) -> None:
+    compare(part, ("fifo", "priority"), orders=True, guarded=True, jitter=jitter, rates=True)
+
+
+@pytest.mark.parametrize("schedulers", [("fair",), ("turns",)], ids="-".join)
+def test_several_rates_on_shared_cores_equal_to_the_nanosecond(
+    part: str, schedulers: Sequence[Scheduler]
+) -> None:
+    tolerance_ns = FAIR_TOLERANCE_NS if "fair" in schedulers else 0
+    compare(part, schedulers, tolerance_ns, rates=True)
 
 
 @pytest.mark.parametrize(

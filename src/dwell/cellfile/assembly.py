@@ -119,6 +119,7 @@ class Assembly:
             tasks=tasks,
             flows=flows,
             scales=dict(entry.scales or {}),
+            chains=timing.chains if timing is not None else {},
             candidates=candidates,
             broken_candidates=[name for name, moves in entry.candidates.items() if moves is None],
             scenarios=scenarios,

@@ -36,6 +36,7 @@ from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import (
     Bursts,
     Caps,
+    Chain,
     Constant,
     ControllerSettings,
     Endpoint,
@@ -381,7 +382,7 @@ TASK = shape_of(
         ),
     ),
 )
-FLOW = shape_of(Flow, {})
+FLOW, CHAIN = shape_of(Flow, {}), shape_of(Chain, {})
 
 # ------------------------------------------------------------- scenarios, objective, control
 
@@ -449,7 +450,7 @@ LIVE = shape_of(
 
 # ------------------------------------------------------------------------------------ cell
 
-_SECTIONS = ("tasks", "flows", "scales")
+_SECTIONS = ("tasks", "flows", "scales", "chains")
 _TIMING = [
     _key(Pipeline, one.name, stand_in=LARGEST if one.name == "period_ms" else FAULTY)
     for one in declared_fields(Pipeline)
@@ -487,6 +488,7 @@ CELL = FileKind.of(
     _needed("tasks", MappingForm(TASK, keeps=True, least=1)),
     _section("flows", ListForm(FLOW, keeps=True)),
     _section("scales", MappingForm(PROCESS, keeps=True)),
+    _section("chains", MappingForm(CHAIN, keeps=True)),
     _needed("candidates", MappingForm(MappingForm(NAME), keeps=True, least=1)),
     _section("scenarios", MappingForm(ListForm(DISTURBANCE, keeps=True), keeps=True)),
     _section("objective", OBJECTIVE),

@@ -50,9 +50,14 @@ class PlayedWindows(NamedTuple):
         return self.seen["missed"]
 
     @property
+    def counted(self) -> Ints:
+        """Number of cycles in which a sink is due."""
+        return self.seen["counted"]
+
+    @property
     def violation_rate(self) -> Floats:
         """V_D."""
-        return self.missed / self.cycles
+        return self.missed / self.counted
 
 
 class CandidatePlayer:

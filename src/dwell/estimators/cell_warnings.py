@@ -63,6 +63,8 @@ def warnings_of(problem: Problem) -> Iterator[Fault]:
     yield from _odd_traces(problem)
     yield from _stale_commands(problem)
     yield from _short_dwell(problem)
+    yield from _rare_sinks(problem)
+    yield from _late_offsets(problem)
     yield from _unstable_loops(problem, profile)
     yield from _without_effect(problem)
 
@@ -144,12 +146,12 @@ def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Ta
 
 def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
     """Return the share of each resource's capacity that own work needs."""
-    work_ms = dict.fromkeys(problem.fabric.resources, 0.0)
+    work_ms, rates = dict.fromkeys(problem.fabric.resources, 0.0), problem.pipeline.rates
     for task in problem.pipeline.tasks.values():
         execution = task.on[placement[task.name]]
         threads = execution.threads if execution.accelerator is None else 1
-        name = _resource(task, placement)
-        work_ms[name] += mean_ms(problem.pipeline, task, execution) * threads
+        job_ms = mean_ms(problem.pipeline, task, execution) * threads
+        work_ms[_resource(task, placement)] += job_ms / rates[task.name]
     period_ms = problem.pipeline.period_ms
     return {
         name: work_ms[name] / (period_ms * resource.capacity)
@@ -173,8 +175,9 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
 
 def _slow_stages(problem: Problem, placement: Placement) -> Iterator[str]:
     """Yield tasks with too few workers for the time of their jobs."""
-    period_ms, shares = problem.pipeline.period_ms, _own_shares(problem, placement)
+    shares, rates = _own_shares(problem, placement), problem.pipeline.rates
     for task in problem.pipeline.tasks.values():
+        period_ms = problem.pipeline.period_ms * rates[task.name]
         node = problem.fabric.nodes[placement[task.name]]
         execution = task.on[node.name]
         job_ms = mean_ms(problem.pipeline, task, execution)
@@ -199,9 +202,11 @@ class _Jobs(NamedTuple):
 def _wide_jobs(problem: Problem, placement: Placement, node: Node, left: float) -> Iterator[str]:
     """Yield a warning if jobs take more than a period because they cannot all run at once."""
     period_ms, jobs, alone_ms = problem.pipeline.period_ms, {}, 0.0
+    rates = problem.pipeline.rates
     for task, execution in _on_cpu(problem, node, placement):
         cores = min(execution.threads, node.cores)
-        ms = mean_ms(problem.pipeline, task, execution) * execution.threads / cores
+        job_ms = mean_ms(problem.pipeline, task, execution) * execution.threads / cores
+        ms = job_ms / rates[task.name]
         jobs[task.name] = _Jobs(cores, min(execution.workers, node.cores // cores), ms)
         alone_ms = max(alone_ms, ms / execution.workers)
     # At least this share of the cycles loses no message.
@@ -289,7 +294,8 @@ def _full_links(problem: Problem, placement: Placement) -> Iterator[str]:
     sent_bytes = dict.fromkeys(problem.fabric.links, 0.0)
     for flow, link in _crossings(problem, placement):
         attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
-        sent_bytes[link.name] += attempts * flow.payload_bytes
+        rate = problem.pipeline.message_rate(flow)
+        sent_bytes[link.name] += attempts * flow.payload_bytes / rate
     for name, link in problem.fabric.links.items():
         mbps = 8e-3 * sent_bytes[name] / problem.pipeline.period_ms
         if mbps > link.rate_mbps:
@@ -474,7 +480,7 @@ def _odd_traces(problem: Problem) -> Iterator[Fault]:
     """Yield timed traces with instants that are probably wrong or in another unit."""
     period_ms = problem.pipeline.period_ms
     processes = chain.from_iterable(map(partial(processes_of, problem), problem.scenarios.values()))
-    traces = (process for _, process in processes if isinstance(process, Trace))
+    traces = (process for _, process, _ in processes if isinstance(process, Trace))
     for table in {id(trace.table): trace.table for trace in traces}.values():
         if table.time_ms is None:
             continue
@@ -500,6 +506,30 @@ def _short_dwell(problem: Problem) -> Iterator[Fault]:
             f"{cycles} is less than decide_cycles = {every} and counts as {every}, because a move "
             "is decided every decide_cycles only; raise it, lower decide_cycles, or remove it",
         )
+
+
+def _rare_sinks(problem: Problem) -> Iterator[Fault]:
+    """Yield a time between decisions in which the slowest sink may not run."""
+    interval, every = problem.pipeline.sink_cycles, problem.decide_cycles
+    if every < interval:
+        yield Fault(
+            "controller.decide_cycles",
+            f"{every} is less than the {interval} cycles from one run of the slowest sink to its "
+            f"next, so that some decisions see no latency; raise it to {interval}, or remove it",
+        )
+
+
+def _late_offsets(problem: Problem) -> Iterator[Fault]:
+    """Yield offsets beyond the deadline of tasks on the way to a sink."""
+    pipeline = problem.pipeline
+    for name, sinks in pipeline.sink_rates.items():
+        offset_ms = pipeline.tasks[name].offset_ms
+        if sinks and offset_ms > pipeline.deadline_ms:
+            yield Fault(
+                f"tasks.{name}.offset_ms",
+                f"{offset_ms:g} ms is beyond deadline_ms = {pipeline.deadline_ms:g}: each cycle "
+                "with a run of this task misses; lower it, or raise the deadline",
+            )
 
 
 def _stale_commands(problem: Problem) -> Iterator[Fault]:

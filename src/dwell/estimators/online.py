@@ -332,7 +332,7 @@ class Online(CellEstimator):
         problem, here = self.problem, self.problem.candidates[name]
         pipeline, resources = problem.pipeline, problem.fabric.resources
         fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
-        share = dict.fromkeys(resources, 0.0)
+        share, rates = dict.fromkeys(resources, 0.0), pipeline.rates
         for there in problem.candidates.values():
             apart = pipeline.diverging(here, there)
             # In the order of tasks: the order of a set, and the rounding of the sum, may differ.
@@ -342,7 +342,7 @@ class Online(CellEstimator):
                 execution = pipeline.tasks[task].on[there[task]]
                 resource = execution.resource(there[task])
                 threads = execution.threads if execution.accelerator is None else 1
-                busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads
+                busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads / rates[task]
                 capacity = resources[resource].capacity
                 share[resource] += fraction * busy_ms / pipeline.period_ms / capacity
         return FrozenDict(share)

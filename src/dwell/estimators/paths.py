@@ -12,7 +12,7 @@ from dwell.model.pipeline import Flow, Pipeline
 
 
 class Input(NamedTuple):
-    """A flow into a task."""
+    """A flow into a task that waits for it."""
 
     flow: Flow
     #: Index of the flow in the pipeline.
@@ -22,7 +22,7 @@ class Input(NamedTuple):
 
 
 class Step(NamedTuple):
-    """A task with its inputs, looked up once per pipeline."""
+    """A task with its waited inputs, looked up once per pipeline."""
 
     task: str
     #: Index of the task in the pipeline.
@@ -43,7 +43,7 @@ def steps_of(pipeline: Pipeline) -> tuple[Step, ...]:
             name,
             place[name],
             float(pipeline.tasks[name].offset_ms),
-            tuple(Input(f, columns[f], place[f.source]) for f in pipeline.inputs(name)),
+            tuple(Input(f, columns[f], place[f.source]) for f in pipeline.waited(name)),
             not pipeline.outputs(name),
         )
         for name in pipeline.topological()

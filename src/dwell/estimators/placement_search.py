@@ -124,7 +124,7 @@ def search(
     PlacementError
         If no placement is feasible; with the reasons.
     SimulationError
-        If `cycles`, `seed` or `top` is out of range.
+        If `cycles`, `seed` or `top` is out of range, or tasks have several rates.
     """
     ranking = rank(problem, (scenario,), cycles=cycles, seed=seed, top=top)
     return [(one.placement, one.qos, one.cost) for one in ranking.best]
@@ -143,6 +143,11 @@ def rank(
 
     `most` is the largest number of partial placements to look at.
     """
+    if problem.pipeline.has_rates:
+        raise SimulationError(
+            f"cell {problem.name!r} has `every` or `sampled`, which the search of placements does "
+            "not support; remove them, or list the candidates"
+        )
     for name, value, least in (("cycles", cycles, 1), ("seed", seed, 0), ("top", top, 1)):
         if isinstance(value, bool) or value < least:
             raise SimulationError(

@@ -44,10 +44,11 @@ class PresentTables:
         self.changes = tables.changes[own & (tables.changes["at_ns"] < LAST_NS)]
         self._declared_changes = self.changes
         self._nothing_ns = np.zeros(real.cycles, np.int64)
-        hops = list(enumerate(real.hops, part.hop_0))
+        hops, rates = list(enumerate(real.hops, part.hop_0)), _rates(problem)
         #: Extra delays of each message, and of its shadows.
         self._layers = {
-            Message(*hop): tables.layers[row :: len(hops)][: part.rows] for row, hop in hops
+            Message(*hop): tables.layers[row :: len(hops) + len(real.forwards)][: part.rows]
+            for row, hop in hops
         }
         links = {hop[2]: tables.links[tables.hops["link"][row]].tolist()[-2:] for row, hop in hops}
         self._rates = {link: tables.rates[slice(*row)] for link, row in links.items()}
@@ -61,9 +62,12 @@ class PresentTables:
             self._declared += [(played.exec_ns, declared.exec_ns)]
             self._declared += [(played.delay_ns, declared.delay_ns)]
             for site, row in zip(played.sites, played.exec_ns, strict=True):
-                self._rows.setdefault(Site(*site), []).append(TimesRow.of(row))
-            for hop, row in zip(played.hops, played.delay_ns, strict=True):
-                self._rows.setdefault(Message(*hop), []).append(TimesRow.of(row))
+                of_site = self._rows.setdefault(Site(*site), [])
+                of_site.append(TimesRow.of(row, rates[site[0]]))
+            # The rows of forwards come after.
+            for hop, row in zip(played.hops, played.delay_ns, strict=False):
+                of_hop = self._rows.setdefault(Message(*hop), [])
+                of_hop.append(TimesRow.of(row, rates.get(hop[:2], 1)))
         self._stretched: dict[Part, float] = {
             Site(*site): _stretched(problem, Site(*site)) for site in real.sites
         }
@@ -113,6 +117,15 @@ class PresentTables:
                 # Delays include lost attempts. A link that loses half its messages is down.
                 self._rates[link]["loss"] = 0.0
                 self._segments[link]["is_down"] = share >= 0.5
+
+
+def _rates(problem: Problem) -> dict[str | tuple[str, str], int]:
+    """Return the cycles from one run of each task to its next, and the same for messages."""
+    pipeline = problem.pipeline
+    rates: dict[str | tuple[str, str], int] = dict(pipeline.rates.items())
+    for flow in pipeline.flows:
+        rates[flow.source, flow.target] = pipeline.message_rate(flow)
+    return rates
 
 
 def _stretched(problem: Problem, site: Site) -> float:

@@ -264,21 +264,21 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
     (_, l95_error_ms), (_, violation_error) = mean_and_error(windows_ms), mean_and_error(rates)
     if l95_error_ms and not violation_error:
         # Windows are random, but all miss the same number of deadlines: usually none, or all.
-        violation_error = unseen_error(violation_rate, len(rates) * problem.window_cycles)
+        violation_error = unseen_error(violation_rate, int(windows.counted.sum()))
     if is_last:
         l95_error_ms, violation_error = slow.errors(
             problem, realisation, name, windows_ms, rates, (l95_error_ms, violation_error)
         )
     since = first * problem.window_cycles
     latency_ns, outcome = tables.latency_ns[0, since:], tables.outcome[0, since:]
-    done = outcome == CycleOutcome.DONE
+    done, is_idle = outcome == CycleOutcome.DONE, outcome == CycleOutcome.IDLE
     finished_ms = latency_ns[done] / 1e6
     usual_ms = float(np.median(finished_ms)) if len(finished_ms) else 0.0
     # A cycle that is unfinished and no older than usual may complete or not: it is left out.
     age_ms = (realisation.release_ns[-1] - realisation.release_ns[since:-1]) / 1e6
     is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
-    lost = int(np.count_nonzero(~done & ~is_young))
-    uncut_ms, is_lost = _known_later(latency_ns.reshape(len(rates), -1), windows_ms)
+    lost = int(np.count_nonzero(~done & ~is_young & ~is_idle))
+    uncut_ms, is_lost = _known_later(latency_ns, is_idle, windows_ms)
     open_windows = is_young.reshape(len(rates), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
@@ -290,7 +290,9 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
     return Price(
         l95_ms=l95_ms,
         l95_error_ms=l95_error_ms,
-        uncut_l95_ms=math.inf if lost > 0.05 * len(done) else max(float(uncut_ms.mean()), l95_ms),
+        uncut_l95_ms=math.inf
+        if lost > 0.05 * np.count_nonzero(~is_idle)
+        else max(float(uncut_ms.mean()), l95_ms),
         violation_rate=violation_rate,
         violation_error=violation_error,
         latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,
@@ -339,12 +341,20 @@ def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
     return FrozenDict(zip(problem.fabric.resources, shares.round(12).tolist(), strict=True))
 
 
-def _known_later(latency_ns: Ints, seen_ms: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def _known_later(
+    latency_ns: Ints, is_idle: NDArray[np.bool_], seen_ms: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
     """Return L95 of every window by the final latencies, milliseconds, and whether it is lost.
 
-    L95 of a lost window is its value at the end of the window. `latency_ns` has shape (windows, W),
-    with `NEVER_NS` for cycles that did not complete.
+    L95 of a lost window is its value at the end of the window. `latency_ns` has `NEVER_NS` for
+    cycles that did not complete; idle cycles do not count.
     """
-    l95_ns = order_statistic(latency_ns, 95)
+    windows = latency_ns.reshape(len(seen_ms), -1)
+    if is_idle.any():
+        idle = is_idle.reshape(windows.shape)
+        each = [order_statistic(one[~off], 95) for one, off in zip(windows, idle, strict=True)]
+        l95_ns = np.array(each)
+    else:
+        l95_ns = order_statistic(windows, 95)
     is_lost = l95_ns >= NEVER_NS
     return np.where(is_lost, seen_ms, np.maximum(l95_ns / 1e6, seen_ms)), is_lost

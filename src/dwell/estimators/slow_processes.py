@@ -8,6 +8,7 @@ how often each process occurred, since single cycles are then correlated.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -197,11 +198,18 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     """Return the slow processes of a cell under a scenario."""
     items, fabric = problem.scenario(scenario), problem.fabric
     processes = list(processes_of(problem, items))
-    tables = {id(one.table): one.table for _, one in processes if isinstance(one, Trace)}
-    loops = tuple(table.loop_cycles(problem.pipeline.period_ms) for table in tables.values())
+    tables = {id(one.table): one.table for _, one, _ in processes if isinstance(one, Trace)}
+    slowest = dict.fromkeys(tables, 1)
+    for _, process, rate in processes:
+        if isinstance(process, Trace) and process.table.by == "row":
+            slowest[id(process.table)] = max(slowest[id(process.table)], rate)
+    loops = tuple(
+        slowest[table_id] * table.loop_cycles(problem.pipeline.period_ms)
+        for table_id, table in tables.items()
+    )
     # If rows are closer in time than releases, a loop skips some of them.
     replayed = [loop >= table.rows for loop, table in zip(loops, tables.values(), strict=True)]
-    random = any(not isinstance(one, Constant | Trace) for _, one in processes)
+    random = any(not isinstance(one, Constant | Trace) for _, one, _ in processes)
     lossy = any(link.loss for link in fabric.links.values()) or any(
         isinstance(item, LinkDisturbance) and item.loss for item in items
     )
@@ -214,8 +222,8 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     return SlowProcesses(
         on_off=tuple(one for one in on_off.values() if one.on_ms > RARE * one.renewal_ms),
         memories=tuple(
-            Memory(places, (1 + one.rho) / (1 - one.rho))
-            for places, one in processes
+            Memory(places, rate * (1 + one.rho) / (1 - one.rho))
+            for places, one, rate in processes
             if isinstance(one, AR1) and one.cv and one.rho > 0
         ),
         loops=loops,
@@ -224,23 +232,33 @@ def slow_processes(problem: Problem, scenario: str) -> SlowProcesses:
     )
 
 
-def processes_of(problem: Problem, scenario: Scenario) -> Iterator[tuple[frozenset[str], Process]]:
-    """Yield the processes that have a value for each cycle, and the nodes and links they act on."""
+def processes_of(
+    problem: Problem, scenario: Scenario
+) -> Iterator[tuple[frozenset[str], Process, int]]:
+    """Yield the processes that have a value for each run of a task, or for each message.
+
+    Yields the nodes and links that the process acts on, the process, and the cycles from one value
+    to the next; for links, of the slowest flow.
+    """
     pipeline, fabric = problem.pipeline, problem.fabric
-    yield frozenset(fabric.nodes), pipeline.release_jitter_ms
+    rates, sent = pipeline.rates, dict.fromkeys(fabric.links, 1)
+    for flow, placement in itertools.product(pipeline.flows, problem.candidates.values()):
+        crossed = f"{placement[flow.source]}->{placement[flow.target]}"
+        sent[crossed] = max(sent.get(crossed, 1), pipeline.message_rate(flow))
+    yield frozenset(fabric.nodes), pipeline.release_jitter_ms, 1
     for name, scale in pipeline.scales.items():
         scaled = [task.on for task in pipeline.tasks.values() if task.scale == name]
-        yield frozenset(node for on in scaled for node in on), scale
+        yield frozenset(node for on in scaled for node in on), scale, 1
     for task in pipeline.tasks.values():
         for node, execution in task.on.items():
-            yield frozenset((node,)), execution.exec_ms
+            yield frozenset((node,)), execution.exec_ms, rates[task.name]
     for name, link in fabric.links.items():
-        yield frozenset((name,)), link.delay_ms
+        yield frozenset((name,)), link.delay_ms, sent[name]
         if link.bursts is not None:
-            yield frozenset((name,)), link.bursts.add_delay_ms
+            yield frozenset((name,)), link.bursts.add_delay_ms, sent[name]
     for item in scenario:
         if isinstance(item, LinkDisturbance) and item.add_delay_ms is not None:
-            yield frozenset((item.link,)), item.add_delay_ms
+            yield frozenset((item.link,)), item.add_delay_ms, sent[item.link]
 
 
 def _on_off(problem: Problem, scenario: Scenario) -> Iterator[OnOff]:

@@ -150,7 +150,7 @@ class StepwisePlayer:
             means = (
                 _mean(windows.l95_ms),
                 _mean(self.declared.l95_ms[name][first:last]),
-                _mean(windows.missed) / self._window,
+                _mean(windows.missed) / _mean(windows.counted),
                 _mean(self.declared.violation_rate[name][first:last]),
                 _mean(windows.uncut_ms),
                 *_mean_shares(windows.shares[:, 1]),

@@ -7,12 +7,38 @@
 namespace dwell {
 namespace {
 
-template <bool has_quotas, bool is_plain>
+template <bool has_quotas, bool is_plain, bool has_rates>
 Status advance(const Tables& tables) {
-  Simulation<has_quotas, is_plain> simulation(tables);
+  Simulation<has_quotas, is_plain, has_rates> simulation(tables);
   const Status status = play(simulation);
   simulation.queue.save(tables.clock[0]);
   return status;
+}
+
+template <bool has_rates>
+Status advance(const Tables& tables) {
+  const bool is_plain = tables.cells.size == 1 && tables.log.size == 0;
+  if (tables.quotas.size > 0) {
+    return is_plain ? advance<true, true, has_rates>(tables)
+                    : advance<true, false, has_rates>(tables);
+  }
+  return is_plain ? advance<false, true, has_rates>(tables)
+                  : advance<false, false, has_rates>(tables);
+}
+
+// Marks the instants of tasks and flows that do not run in a cycle as not due.
+template <class S>
+void mark_undue(const S& s, i64 cell, i64 cycle, i64 n_tasks, const i64* flows, i64 n_flows,
+                i64* ready_ns) {
+  i64 *end_ns = ready_ns + n_tasks, *arrived_ns = end_ns + n_tasks;
+  i64 *work_ns = arrived_ns + n_flows, *start_ns = work_ns + n_tasks;
+  for (i64 task = 0; task < n_tasks; ++task) {
+    if (s.is_due(s.task(cell, task), cycle)) continue;
+    ready_ns[task] = end_ns[task] = work_ns[task] = start_ns[task] = kNotDue;
+  }
+  for (i64 i = 0; i < n_flows; ++i) {
+    if (!s.is_due(s.flow(cell, flows[i]), cycle)) arrived_ns[i] = kNotDue;
+  }
 }
 
 }  // namespace
@@ -22,11 +48,8 @@ using namespace dwell;
 
 // Continues a simulation; returns a Status.
 DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
-  const bool is_plain = tables->cells.size == 1 && tables->log.size == 0;
-  if (tables->quotas.size > 0) {
-    return is_plain ? advance<true, true>(*tables) : advance<true, false>(*tables);
-  }
-  return is_plain ? advance<false, true>(*tables) : advance<false, false>(*tables);
+  if (tables->clock[0].has_rates) return advance<true>(*tables);
+  return advance<false>(*tables);
 }
 
 // Adds an event of the caller; the queue must have room.
@@ -41,7 +64,7 @@ DWELL_EXPORT void dwell_post_event(const Tables* tables, i64 at_ns, i64 key) noe
 DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_cells, i64 first,
                                       i64 n, i64 n_tasks, const i64* flows, i64 n_flows, i64* out,
                                       i64* beside) noexcept {
-  const Simulation<false, false> s(*tables);
+  const Simulation<false, false, true> s(*tables);
   for (i64 cycle = first; cycle < first + n; ++cycle) {
     for (i64 cell = cell_0; cell < cell_0 + n_cells; ++cell) {
       const i64 row = s.log_row(cell, cycle);
@@ -60,6 +83,9 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
         beside += 2;
       }
       for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
+      if (tables->clock[0].has_rates && cell == cell_0) {
+        mark_undue(s, cell, cycle, n_tasks, flows, n_flows, out);
+      }
       out = start_ns + n_tasks;
     }
   }
@@ -70,7 +96,7 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
 // have room.
 DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64 attempt, i64 key,
                                    i64 now, i64* out) noexcept {
-  Simulation<true, false> simulation(*tables);
+  Simulation<true, false, true> simulation(*tables);
   const StateAttempt next = send_state(simulation, hop, cycle, attempt, key, now);
   simulation.queue.save(tables->clock[0]);
   out[0] = next.at_ns;
@@ -79,7 +105,7 @@ DWELL_EXPORT void dwell_send_state(const Tables* tables, i64 hop, i64 cycle, i64
 
 // Releases the messages that wait for state that is not sent again.
 DWELL_EXPORT void dwell_end_repeats(const Tables* tables, i64 key, i64 now) noexcept {
-  Simulation<true, false> simulation(*tables);
+  Simulation<true, false, true> simulation(*tables);
   end_repeats(simulation, key, now);
   simulation.queue.save(tables->clock[0]);
 }

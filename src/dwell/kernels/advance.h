@@ -26,13 +26,19 @@ void handle(S& s, i64 key, i64 now) {
       complete(s, key, now);
       break;
     case kArrival:
-      if (!is_given_up(s, cell, cycle)) arrive(s, cell, cycle, item, now);
+      if (is_forward(s, item)) {
+        arrive_forward(s, cell, cycle, item, now);
+      } else if (!is_given_up(s, cell, cycle)) {
+        arrive(s, cell, cycle, item, now);
+      }
       break;
     case kStart:
       if (!is_given_up(s, cell, cycle)) note_ready(s, job_key(cell, cycle, item));
       break;
     case kRetry:
-      if (is_given_up(s, cell, cycle)) {
+      if (is_forward(s, item)) {
+        retry_forward(s, cell, cycle, item, now);
+      } else if (is_given_up(s, cell, cycle)) {
         end_repeats(s, make_key(kArrival, cell, cycle, item), now);
       } else {
         retry(s, cell, cycle, item, now);

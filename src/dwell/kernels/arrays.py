@@ -177,7 +177,7 @@ class Arrays:
         """Double the capacity of the queue of events and of the held messages."""
         t = self.tables
         room = 2 * len(t.events)
-        names = ("events", "following", "held")
+        names = ("events", "following", "held", "repeats")
         self._use(t._replace(**{name: np.resize(getattr(t, name), room) for name in names}))
 
     def grow_ring(self) -> None:
@@ -205,6 +205,8 @@ class Arrays:
         }
         if len(t.log) and not clock["logs_all"]:
             rings |= {"log": t.log, "log_outcome": t.log_outcome, "log_arrived": t.log_arrived}
+            if len(t.log_taken):
+                rings["log_taken"] = t.log_taken
         self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
 
 
@@ -214,6 +216,24 @@ BY_CELL = (
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
 )
+
+
+class JobLogs(NamedTuple):
+    """The log of a cell's jobs and messages.
+
+    Parameters
+    ----------
+    jobs, outcomes : arrays, shape (rows, cycles, tasks)
+        Instants and outcomes of all jobs.
+    arrived_ns, taken : int64 arrays, shape (rows, cycles, flows)
+        Arrival of each message, and cycle of the sampled message that a job of this cycle took; -1
+        for none. Flows have the order of `flow_rows`.
+    """
+
+    jobs: Rows
+    outcomes: NDArray[np.int8]
+    arrived_ns: Ints
+    taken: Ints
 
 
 class CellArrays:
@@ -246,18 +266,17 @@ class CellArrays:
             )
         return self._tables
 
-    def logs(self) -> tuple[Rows, NDArray[np.int8], Ints]:
-        """Return the instants and outcomes of all jobs, and the arrivals of all messages.
-
-        The shapes are (rows, cycles, tasks) and (rows, cycles, flows), with flows in the order of
-        `flow_rows`; an arrival is -1 if the message did not arrive. Needs a log of all jobs.
-        """
+    def logs(self) -> JobLogs:
+        """Return the log of all jobs and messages; needs a log of all jobs."""
         whole, part = self.whole.tables, self.part
         shape = len(whole.cells), int(whole.clock[0]["n_cycles"]), -1
         own = slice(part.row, part.row + part.rows), slice(part.cycles)
         tasks = *own, slice(part.tasks)
         log, outcome = whole.log.reshape(shape), whole.log_outcome.reshape(shape)
-        return log[tasks], outcome[tasks], whole.log_arrived.reshape(shape)[own]
+        arrived, taken = (
+            table.reshape(shape)[own] for table in (whole.log_arrived, whole.log_taken)
+        )
+        return JobLogs(log[tasks], outcome[tasks], arrived, taken)
 
 
 def lay_out(
@@ -324,6 +343,8 @@ class _Layout:
         self.behind: list[Ints] = []
         self.end_ns = 0
         self.outputs: list[int] = []
+        self.sampled: list[int] = []
+        self.sink_rates: list[int] = []
         self.cell_servers: list[int] = []
         self.capacity: list[float] = []
         self.layers: list[dict[int, int]] = []
@@ -466,7 +487,11 @@ class _Layout:
             "flow_0": len(self.rows["flows"]),
             "candidate_0": part.candidate_0,
             "n_candidates": part.candidates,
-            "n_sinks": sum(not pipeline.outputs(name) for name in names),
+            "n_sinks": len(pipeline.sinks),
+            "sampled_0": len(self.sampled),
+            "n_sampled": sum(flow.sampled for flow in flows),
+            "forward_0": len(self.rows["forwards"]),
+            "n_forwards": len(real.forwards),
             "period_ns": pipeline.period_ns,
             "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
             "pair_0": len(self.shadow_parts),
@@ -482,20 +507,33 @@ class _Layout:
         self.capacity += [one.capacity for one in resources]
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         self.rows["flows"] += [
-            {"source": names.index(flow.source), "target": names.index(flow.target)}
+            {
+                "source": names.index(flow.source),
+                "target": names.index(flow.target),
+                "is_sampled": flow.sampled,
+                "every": pipeline.message_rate(flow),
+            }
             for flow in flows
         ]
+        self.sampled += [
+            flow_row[flow.source, flow.target] for flow in pipeline.flows if flow.sampled
+        ]
+        rates, needed_by = pipeline.rates, pipeline.sink_rates
         for name, task in pipeline.tasks.items():
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
             self.rows["tasks"].append(
                 {
-                    "n_in": len(pipeline.inputs(name)),
+                    "n_in": len(pipeline.waited(name)),
                     "n_out": len(outputs),
                     "out_0": len(self.outputs),
                     "offset_ns": round(task.offset_ms * 1e6),
+                    "every": rates[name],
+                    "rate_0": len(self.sink_rates),
+                    "n_rates": len(needed_by[name]),
                 }
             )
             self.outputs += outputs
+            self.sink_rates += needed_by[name]
 
     def _add_candidates(
         self,
@@ -509,6 +547,7 @@ class _Layout:
         hop_row = {hop: hop_0 + i for i, hop in enumerate(real.hops)}
         names = list(problem.pipeline.tasks)
         site_row = self._add_sites(index, problem, real, names)
+        self._add_forwards(problem, real, hop_0 + len(real.hops), site_row)
         for placement in problem.candidates.values():
             on = [site_row[name, placement[name]] for name in names]
             self.site_of.append(on + [-1] * (self.max_tasks - len(on)))
@@ -520,6 +559,26 @@ class _Layout:
             ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
             self.back_ns.append(back_ns(problem, placement))
+
+    def _add_forwards(
+        self,
+        problem: Problem,
+        real: Realisation,
+        hop_0: int,
+        site_row: Mapping[tuple[str, str], int],
+    ) -> None:
+        """Add the forwards of sampled messages; their hops follow the hops of flows."""
+        ends = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]
+        for hop, (source, target, name) in enumerate(real.forwards, hop_0):
+            link = problem.fabric.links[name]
+            self.rows["forwards"].append(
+                {
+                    "flow": ends.index((source, target)),
+                    "from_site": site_row[target, link.source],
+                    "to_site": site_row[target, link.target],
+                    "hop": hop,
+                }
+            )
 
     def _add_pairs(self, problem: Problem) -> None:
         """Add the roles of the tasks for a shadow, by pair of candidates."""
@@ -637,8 +696,9 @@ class _Layout:
         payload |= {
             (task.name, task.name): task.state_bytes for task in problem.pipeline.tasks.values()
         }
+        rows = self._addresses(real.delay_ns), real.loss_keys
         for (source, target, link_name), delay_ns, loss_key in zip(
-            real.hops, self._addresses(real.delay_ns), real.loss_keys, strict=True
+            (*real.hops, *real.forwards), *rows, strict=True
         ):
             self.rows["hops"].append(
                 {
@@ -658,12 +718,17 @@ class _Layout:
             ("cells", len(self.rows["cells"]), codes.CELL_MASK),
             ("tasks of a cell", self.max_tasks, codes.ITEM_MASK),
             ("flows of a cell", self.max_flows, codes.MOST_FLOWS),
+            ("flows and forwards of a cell", self._most_messages(), codes.MOST_FLOWS),
             ("feasible (task, node) pairs", len(self.rows["sites"]), codes.ITEM_MASK),
             ("nodes and accelerators", len(self.rows["servers"]), codes.ITEM_MASK - 1),
         )
         for what, number, limit in limits:
             if number > limit:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
+
+    def _most_messages(self) -> int:
+        """Largest number of flows of a cell, and of forwards of its sampled flows."""
+        return self.max_flows + max(len(real.forwards) for _, real in self.cells)
 
     def _foreign(self, server: Mapping[str, Any], changes: Rows) -> int:
         """Largest number of a server's foreign threads that take turns; 0 without turns."""
@@ -696,6 +761,7 @@ class _Layout:
             "n_layers": n_layers,
             "n_resources": self.max_resources,
             "has_shared": len(self.cells) > 1 and bool(self.shared),
+            "has_rates": any(problem.pipeline.has_rates for problem, _ in self.cells),
             "n_cycles": cycles,
             "n_windows": windows,
             "n_looks": looks,
@@ -713,6 +779,7 @@ class _Layout:
         room = {
             "events": 4 * margin,
             "held": len(rows["events"]) + 4 * margin,
+            "repeats": len(rows["events"]) + 4 * margin,
             "running": base,
             "waiting": base,
             "jobs": cells * slots * self.max_tasks,
@@ -742,6 +809,8 @@ class _Layout:
         }
         lists: dict[str, list[Any]] = {
             "outputs": self.outputs,
+            "sampled": self.sampled,
+            "sink_rates": self.sink_rates,
             "cell_servers": self.cell_servers,
             "capacity": self.capacity,
             "site_of": self.site_of,
@@ -755,6 +824,9 @@ class _Layout:
             "latency_ns": np.full((cells, cycles), NEVER_NS),
             "log": _as_rows("log", np.full((logged * self.max_tasks, 6), -1)),
             "log_arrived": np.full((logged, self.max_flows), -1),
+            "log_taken": np.full((logged if clock["has_rates"] else 0, self.max_flows), -1),
+            "forwarded": np.full(len(rows["forwards"]), -1),
+            "values": np.full((len(rows["sites"]) * clock["has_rates"], self.max_flows), -1),
             "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
             "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
             "soonest_ns": np.full((len(self.site_of), self.max_tasks), -1),

@@ -67,7 +67,7 @@ template <class S>
       Job& job = s.jobs[row * s.n_tasks + task];
       const bool waits = 0 < job.missing && job.missing < s.task(cell, task).n_in;
       if (waits && s.site(job).node == node) {
-        lose(s, cell, slot.cycle, kNodeDown);
+        lose(s, cell, slot.cycle, task, kNodeDown);
         job.missing = kNever;
       }
     }
@@ -82,6 +82,7 @@ template <class S>
     if (site.node != node) continue;
     if (is_down) {
       drop_waiting(s, site, now);
+      forget_values(s, row);
       site.idle = site.workers;
       continue;
     }

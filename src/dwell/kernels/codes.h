@@ -5,8 +5,8 @@
 
 namespace dwell {
 
-// Outcomes of cycles and jobs.
-enum Outcome : i8 { kInFlight, kDone, kDropped, kReplaced, kNodeDown };
+// Outcomes of cycles and jobs; `kNotApplied` is an outcome of live cycles only.
+enum Outcome : i8 { kInFlight, kDone, kDropped, kReplaced, kNodeDown, kNotApplied, kIdle };
 
 // `kTurns` is the scheduler of a fair node whose quota takes effect at ticks.
 enum Scheduler : i8 { kFair, kFifo, kPriority, kTurns };

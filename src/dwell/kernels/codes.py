@@ -9,9 +9,9 @@ LAST_NS = (1 << 63) - 1024
 
 
 class CycleOutcome(IntEnum):
-    """Outcome of a cycle or a job."""
+    """Outcome of a cycle or a job; NOT_APPLIED is an outcome of live cycles only."""
 
-    IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN = range(5)
+    IN_FLIGHT, DONE, DROPPED, REPLACED, NODE_DOWN, NOT_APPLIED, IDLE = range(7)
 
 
 class Scheduler(IntEnum):

@@ -3,6 +3,7 @@
 
 #include "links.h"
 #include "remainders.h"
+#include "samples.h"
 
 namespace dwell {
 
@@ -40,14 +41,15 @@ void clear_log(S& s, i64 cell, i64 cycle) {
   std::fill_n(&s.log[row * s.n_tasks], s.n_tasks, Log{-1, -1, -1, -1, 0, 0});
   std::fill_n(&s.log_outcome[row * s.n_tasks], s.n_tasks, i8{kInFlight});
   std::fill_n(&s.log_arrived[row * s.n_flows], s.n_flows, i64{-1});
+  if (S::kRates) std::fill_n(&s.log_taken[row * s.n_flows], s.n_flows, i64{-1});
 }
 
-// Loses a ready job, and therefore its cycle.
+// Loses a ready job, and therefore its cycle if a sink needs the job.
 template <class S>
 void drop_job(S& s, i64 cell, i64 cycle, i64 task, Outcome outcome, i64 now) {
   log_job(s, cell, cycle, task, s.job(cell, cycle, task), outcome, now);
   s.slot(cell, cycle).live -= 1;
-  lose(s, cell, cycle, outcome);
+  lose(s, cell, cycle, task, outcome);
 }
 
 template <class S>
@@ -139,7 +141,8 @@ i64 shared_by(const S& s, i64 cell, i64 cycle, i64 task) {
   return s.shadow_parts[pair * s.n_tasks + task] == kShared ? shadow : -1;
 }
 
-// Counts a sink of a shadow that has all its inputs; the last sink completes the shadow.
+// Counts a sink of a shadow that has all its inputs, or a sampled output of a shadow job; the last
+// one completes the shadow.
 template <class S>
 void finish_shadow(S& s, i64 shadow, i64 cycle, i64 now) {
   if (--s.slot(shadow, cycle).sinks_left > 0) return;
@@ -153,6 +156,15 @@ void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   Job& job = s.job(cell, cycle, ends.target);
   if (!S::kPlain && s.log_arrived.size > 0) {
     s.log_arrived[s.log_row(cell, cycle) * s.n_flows + flow] = now;
+  }
+  if (S::kRates && ends.is_sampled) {
+    s.slot(cell, cycle).live -= 1;
+    if (s.cell(cell).parent >= 0) {
+      finish_shadow(s, cell, cycle, now);
+    } else {
+      bring_value(s, cell, cycle, flow, job.site, now);
+    }
+    return;
   }
   job.missing -= 1;
   if (job.missing == 0 && !is_discarded(s, cell, cycle, ends.target)) {
@@ -179,7 +191,7 @@ void arrive(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
     loss = kNodeDown;
   }
   s.slot(cell, cycle).live -= 1;
-  lose(s, cell, cycle, loss);
+  lose_input(s, cell, cycle, flow & ~kLostOnLink, loss);
 }
 
 // Counts a completed sink; the last sink completes the cycle.
@@ -201,18 +213,31 @@ void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
   S::fetch_next(s.network_ns[row]);
 }
 
+// Number of messages that a task sends in a cycle.
+template <class S>
+i32 sent_by(const S& s, i64 cell, i64 cycle, const Task& from) {
+  if (!S::kRates) return from.n_out;
+  const i32* flows = &s.outputs[from.out_0];
+  return static_cast<i32>(std::count_if(
+      flows, flows + from.n_out, [&](i32 flow) { return s.is_due(s.flow(cell, flow), cycle); }));
+}
+
 // Hands a job's outputs over to tasks on its node, and sends the others.
 template <class S>
 void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   const Task& from = s.task(cell, task);
-  if (from.n_out > 1) s.slot(cell, cycle).live += from.n_out - 1;
+  if (S::kRates || from.n_out > 1) {
+    s.slot(cell, cycle).live += sent_by(s, cell, cycle, from) - 1;
+  }
   // A shadow receives the outputs of shared tasks too, after the cycle's own outputs.
   const i64 shadow = shared_by(s, cell, cycle, task);
   i64 to = cell;
   while (true) {
     for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
       const i64 flow = s.outputs[i];
+      if (!s.is_due(s.flow(cell, flow), cycle)) continue;
       if (to != cell) {
+        if (S::kRates && s.flow(cell, flow).is_sampled) continue;
         if (shared_by(s, cell, cycle, s.flow(cell, flow).target) >= 0) continue;
         s.slot(shadow, cycle).live += 1;
       }
@@ -316,14 +341,14 @@ void mark_accelerators(S& s) {
 // Begins a cycle, or its shadow: the sources become ready.
 //
 // A shadow starts only the sources that it does not share, each by an event, like sources with an
-// offset.
+// offset. It is complete when the sinks and the sampled outputs of its own jobs are.
 template <class S>
 void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now) {
   const Cell& of = s.cell(cell);
   const i64 stamp = s.stamp(cell, cycle);
   const i64 candidate = of.candidate_0 + stamp;
   const i64 pair = of.pair_0 + active * of.n_candidates + stamp;
-  i32 sources = 0, sinks = of.n_sinks;
+  i32 sources = 0, sinks = S::kRates ? 0 : of.n_sinks;
   for (i64 task = 0; task < of.n_tasks; ++task) {
     const Task& fixed = s.task(cell, task);
     Job& job = s.job(cell, cycle, task);
@@ -336,6 +361,12 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     job.site = s.site_of[candidate * s.n_tasks + task];
     job.compute_ns = 0;
     job.network_ns = 0;
+    if (S::kRates) {
+      if (!s.is_due(fixed, cycle)) continue;
+      sinks += fixed.n_out == 0;
+      const bool runs = is_shadow && s.shadow_parts[pair * s.n_tasks + task] == kShadowed;
+      if (runs) sinks += sampled_outputs(s, cell, fixed);
+    }
     if (fixed.n_in > 0) continue;
     if (is_shadow) {
       const i8 part = s.shadow_parts[pair * s.n_tasks + task];
@@ -350,8 +381,13 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     }
   }
   s.slot(cell, cycle) =
-      Slot{cycle, static_cast<i32>(candidate), static_cast<i32>(pair), sources, sinks, 0};
-  if (sinks == 0) s.latency_ns[s.output(cell, cycle)] = 0;
+      Slot{cycle, static_cast<i32>(candidate), static_cast<i32>(pair), sources, sinks, kNothing};
+  if (sinks > 0) return;
+  if (is_shadow) {
+    s.latency_ns[s.output(cell, cycle)] = 0;
+  } else if (S::kRates) {
+    s.outcome[s.output(cell, cycle)] = kIdle;
+  }
 }
 
 // Releases a cycle, and its shadow if it has one; announces the next release.
@@ -360,6 +396,7 @@ void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
   s.cell(cell).released = cycle + 1;
   if (!S::kPlain) give_up_before(s, cell, cycle, now);
+  if (S::kRates) move_values(s, cell, cycle, now);
   clear_log(s, cell, cycle);
   begin_cycle(s, cell, cycle, active, false, now);
   if (!S::kPlain) {
@@ -386,6 +423,7 @@ void settle(S& s, i64 now) {
     const i64 key = s.ready[i];
     const i64 job = key & ~kTaken;
     if (key & kTaken || become_ready(s, cell_of(job), cycle_of(job), item_of(job), now)) {
+      if (S::kRates) take_values(s, job);
       admit(s, job, now);
     }
   }

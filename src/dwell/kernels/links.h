@@ -64,7 +64,7 @@ template <class S>
     return;
   }
   s.slot(cell, cycle).live -= 1;
-  lose(s, cell, cycle, outcome);
+  lose_input(s, cell, cycle, flow, outcome);
 }
 
 // Sends one message of a flow for the first time (attempt 0) or once more.

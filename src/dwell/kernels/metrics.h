@@ -13,37 +13,46 @@ constexpr i64 l95_rank(i64 n) { return (19 * n + 19) / 20; }
 // Whether the value at the rank of L95 is the age of an unfinished cycle; between equal values,
 // latencies precede ages.
 template <class S>
-bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 value, i64 now) {
+bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 rank, i64 value, i64 now) {
   const Cell& of = s.cell(cell);
   const i64 row = s.output(cell, first);
   i64 before = 0;
   for (i64 i = 0; i < n; ++i) {
+    if (S::kRates && s.outcome[row + i] == kIdle) continue;
     const i64 latency_ns = s.latency_ns[row + i];
     const i64 age_ns = now - of.release_ns[first + i];
     before += std::min(latency_ns, age_ns) < value || (latency_ns == value && latency_ns <= age_ns);
   }
-  return before < l95_rank(n);
+  return before < rank;
 }
 
 // Metrics of `n` cycles as known now.
 template <class S>
 [[gnu::noinline]] Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
   const Cell& of = s.cell(cell);
-  const i64 row = s.output(cell, first), rank = l95_rank(n);
-  i64 missed = 0, unfinished = 0;
+  const i64 row = s.output(cell, first);
+  i64 missed = 0, unfinished = 0, counted = 0;
   for (i64 i = 0; i < n; ++i) {
+    if (S::kRates && s.outcome[row + i] == kIdle) continue;
     const i64 latency_ns = s.latency_ns[row + i];
     const i64 age_ns = now - of.release_ns[first + i];
     unfinished += latency_ns > age_ns;
     missed += latency_ns > std::min(age_ns, of.deadline_ns);
-    s.ages[i] = std::min(latency_ns, age_ns);
+    s.ages[S::kRates ? counted++ : i] = std::min(latency_ns, age_ns);
   }
+  if (!S::kRates) counted = n;
+  if (counted == 0) return Seen{first, n, 0, 0, 0.0, 0.0};
+  const i64 rank = l95_rank(counted);
   i64* ages = s.ages.rows;
-  std::nth_element(ages, ages + rank - 1, ages + n);
+  std::nth_element(ages, ages + rank - 1, ages + counted);
   const i64 l95_ns = ages[rank - 1];
   const f64 l95_ms = static_cast<f64>(l95_ns) / 1e6;
-  const bool lost = unfinished > n - rank && is_age(s, cell, first, n, l95_ns, now);
-  return Seen{first, n, missed, std::min(l95_ms, of.longest_ms),
+  const bool lost = unfinished > counted - rank && is_age(s, cell, first, n, rank, l95_ns, now);
+  return Seen{first,
+              n,
+              missed,
+              counted,
+              std::min(l95_ms, of.longest_ms),
               lost ? std::numeric_limits<f64>::infinity() : l95_ms};
 }
 

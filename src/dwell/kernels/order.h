@@ -11,13 +11,43 @@ namespace dwell {
 // The arrival of a held message that is being repeated.
 constexpr i64 kUnknown = -1;
 
-// Marks a cycle that can no longer complete; its first loss determines the outcome.
+// What a cycle has lost: nothing; only jobs and messages that its sinks do not need; or its
+// outcome.
+enum Loss : i8 { kNothing, kUnneeded, kOutcome };
+
+// Whether waited flows lead from a task to a sink that runs in a cycle.
 template <class S>
-void lose(S& s, i64 cell, i64 cycle, Outcome outcome) {
+bool is_needed(const S& s, i64 cell, i64 cycle, i64 task) {
+  if (!S::kRates) return true;
+  const Task& from = s.task(cell, task);
+  const i32* rates = &s.sink_rates[from.rate_0];
+  return std::any_of(rates, rates + from.n_rates, [&](i64 every) { return cycle % every == 0; });
+}
+
+// Marks a cycle that has lost a job of a task, or a message to the task. The first loss that a sink
+// needs determines the outcome.
+template <class S>
+void lose(S& s, i64 cell, i64 cycle, i64 task, Outcome outcome) {
   Slot& slot = s.slot(cell, cycle);
-  if (slot.is_lost) return;
-  slot.is_lost = 1;
+  if (slot.is_lost == kOutcome) return;
+  if (!is_needed(s, cell, cycle, task)) {
+    slot.is_lost = kUnneeded;
+    return;
+  }
+  slot.is_lost = kOutcome;
   s.outcome[s.output(cell, cycle)] = outcome;
+}
+
+// Marks a cycle that has lost the message of a flow.
+template <class S>
+void lose_input(S& s, i64 cell, i64 cycle, i64 flow, Outcome outcome) {
+  const Flow& ends = s.flow(cell, flow);
+  if (S::kRates && ends.is_sampled) {
+    Slot& slot = s.slot(cell, cycle);
+    slot.is_lost = std::max<i32>(slot.is_lost, kUnneeded);
+  } else {
+    lose(s, cell, cycle, ends.target, outcome);
+  }
 }
 
 // Whether a cycle belongs to a shadow that has been given up.
@@ -26,6 +56,13 @@ bool is_given_up(const S& s, i64 cell, i64 cycle) {
   if (S::kPlain || s.cell(cell).parent < 0) return false;
   const Cell& parent = s.cell(s.cell(cell).parent);
   return cycle + parent.given_up_after < parent.released;
+}
+
+// Whether the item of an arrival, or of a repeat, is a forward: after all flows, lost ones
+// included.
+template <class S>
+bool is_forward(const S& s, i64 item) {
+  return S::kRates && item >= kLostOnLink + s.n_flows;
 }
 
 // Adds a message behind all held messages; `key` is the event of its arrival.
@@ -100,8 +137,9 @@ template <class S>
     held.arrival_ns = kUnknown;
     const i64 cell = cell_of(held.key), cycle = cycle_of(held.key);
     if (kind_of(held.key) != kArrival || is_given_up(s, cell, cycle)) continue;
+    if (is_forward(s, item_of(held.key))) continue;
     s.slot(cell, cycle).live -= 1;
-    lose(s, cell, cycle, kInFlight);
+    lose_input(s, cell, cycle, item_of(held.key) & ~kLostOnLink, kInFlight);
   }
 }
 

@@ -292,19 +292,19 @@ DWELL_EXPORT void dwell_weakest(const Pool* const* pools, const i64* parts, i64 
   }
 }
 
-// Writes the times of cycles from `first` on, nanoseconds: the finite values, repeated in turn from
-// cycle 0. Returns the number of finite values.
-DWELL_EXPORT i64 dwell_fill(const f64* values, i64 n, f64 stretched, i64 first, i64 count,
+// Writes the times of runs from `first` on, nanoseconds, into every `rate`-th cycle: the finite
+// values, repeated in turn from run 0. Returns the number of finite values.
+DWELL_EXPORT i64 dwell_fill(const f64* values, i64 n, f64 stretched, i64 first, i64 count, i64 rate,
                             i64* out) noexcept {
   const i64 known = std::count_if(values, values + n, [](f64 ms) { return std::isfinite(ms); });
   if (known == 0) return 0;
-  // First row of each known value.
+  // First run of each known value.
   i64 at = (known - first % known) % known;
   for (i64 i = 0; i < n; ++i) {
     if (!std::isfinite(values[i])) continue;
-    if (at < count) out[at] = static_cast<i64>(std::rint(values[i] * 1e6 / stretched));
+    if (at < count) out[at * rate] = static_cast<i64>(std::rint(values[i] * 1e6 / stretched));
     at = at + 1 == known ? 0 : at + 1;
   }
-  for (i64 i = known; i < count; ++i) out[i] = out[i - known];
+  for (i64 i = known; i < count; ++i) out[i * rate] = out[(i - known) * rate];
   return known;
 }

@@ -238,11 +238,13 @@ class TimesRow(NamedTuple):
 
     address: int
     cycles: int
+    #: Cycles from one value to the next.
+    rate: int = 1
 
     @classmethod
-    def of(cls, row: Ints) -> TimesRow:
+    def of(cls, row: Ints, rate: int = 1) -> TimesRow:
         """Return the row of a contiguous array, for as long as the array exists."""
-        return cls(row.ctypes.data, len(row))
+        return cls(row.ctypes.data, len(row), rate)
 
 
 def fill(
@@ -262,13 +264,17 @@ def fill(
         First column that is filled, and the cycle of column 0.
     """
     values = np.ascontiguousarray(values)
-    where = values.ctypes.data, len(values), stretched, begin + offset
-    for address, cycles in rows:
-        _fill()(*where, cycles - begin, address + begin * BYTES)
+    for address, cycles, rate in rows:
+        first, runs = -(-begin // rate), -(-cycles // rate)
+        out = address + first * rate * BYTES
+        where = first + offset // rate, runs - first, rate, out
+        _fill()(values.ctypes.data, len(values), stretched, *where)
 
 
 _places = foreign("dwell_places", None, c_void_p, c_int64, c_void_p, c_int64, c_double, c_void_p)
-_fill = foreign("dwell_fill", c_int64, c_void_p, c_int64, c_double, c_int64, c_int64, c_void_p)
+_fill = foreign(
+    "dwell_fill", c_int64, c_void_p, c_int64, c_double, c_int64, c_int64, c_int64, c_void_p
+)
 _pool_add = foreign(
     "dwell_pool_add",
     None,

@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import struct
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -299,6 +299,17 @@ class Drawing:
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
         self.hops = tuple(_possible_hops(problem)) if every_hop else _hops(problem)
+        #: Shadow jobs bring no values, so nothing of theirs is forwarded.
+        self.forwards = () if shadow else tuple(_forwards(problem))
+        #: Link of each hop and forward, with the prefix and the end of the names of its streams.
+        self.sent_over = [
+            *((hop[2], "", _hop_name(hop)) for hop in self.hops),
+            *((hop[2], "forward/", _hop_name(hop)) for hop in self.forwards),
+        ]
+        rates = problem.pipeline.rates
+        #: Cycles from one value of each row to its next; all other values are 0.
+        self.site_rates = [rates[task] for task, _ in self.sites]
+        self.hop_rates = _hop_rates(problem, (*self.hops, *self.forwards))
         self.paths: dict[str, Path] = {}
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
@@ -333,44 +344,67 @@ class Drawing:
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
             streams=self.streams,
+            forwards=self.forwards,
         )
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
         """Sample the cycles in `sent`; the others are taken from `whole`, or are 0."""
-        drawn = self._filled(0 if self.sent is None else len(self.sent))
+        sent = np.empty(0, np.int64) if self.sent is None else self.sent
+        drawn = self._filled(len(sent))
         table = np.zeros((len(drawn), self.cycles), np.int64)
         if whole is not None:
             np.concatenate((whole.exec_ns, whole.delay_ns, whole.extra_ns), out=table)
-        for row, values in zip(table, drawn, strict=True):
-            row[self.sent] = values
+        layer_rates = [self.hop_rates[hop] for hop, _ in self._layers()]
+        rates = (*self.site_rates, *self.hop_rates, *layer_rates)
+        for row, values, rate in zip(table, drawn, rates, strict=True):
+            due = sent % rate == 0 if rate > 1 else slice(None)
+            row[sent[due]] = values[due]
         exec_ns, delay_ns, extra_ns = self._parts(table)
         return replace(
             realisation,
             exec_ns=exec_ns,
             delay_ns=delay_ns,
             loss_keys=self._loss_keys(),
+            layers=self._layers(),
             extra_ns=extra_ns,
+            forwards=self.forwards,
         )
 
     def _filled(self, cycles: int) -> Ints:
         """Sample the next cycles, with one row per site, then per hop, then per extra delay."""
         # One block of memory: the system uses larger pages for large blocks.
-        rows = len(self.sites) + len(self.hops) + len(self._layers())
+        rows = len(self.sites) + len(self.sent_over) + len(self._layers())
         table = np.empty((rows, cycles), np.int64)
         for at in range(0, cycles, BLOCK):
             exec_ns, delay_ns, extra_ns = self._parts(table[:, at : at + BLOCK])
-            self._fill_extra(extra_ns)
-            self._fill_executions(exec_ns)
-            self._fill_delays(delay_ns)
+            self._fill_extra(extra_ns, at)
+            self._fill_executions(exec_ns, at)
+            self._fill_delays(delay_ns, at)
         return table
+
+    def _fill(
+        self, row: Ints, at: int, rate: int, path: Path, factors: Floats | None = None
+    ) -> None:
+        """Sample the values of the next cycles in a row; cycles that are not due have 0."""
+        if rate == 1:
+            path.fill_ns(row, factors)
+            return
+        due: slice | NDArray[np.bool_] = slice(-at % rate, None, rate)
+        if self.sent is not None:
+            due = self.sent[at : at + len(row)] % rate == 0
+        row[:] = 0
+        values = row[due].copy()
+        path.fill_ns(values, None if factors is None else np.ascontiguousarray(factors[due]))
+        row[due] = values
 
     def _parts(self, table: Ints) -> list[Ints]:
         """Return the rows of sites, of hops, and of layers of extra delay."""
         sites = len(self.sites)
-        return np.split(table, (sites, sites + len(self.hops)))
+        return np.split(table, (sites, sites + len(self.sent_over)))
 
     def _loss_keys(self) -> NDArray[np.uint64]:
-        return np.array([self._key(f"loss/{_hop_name(hop)}") for hop in self.hops], np.uint64)
+        names = [f"{prefix}loss/{name}" for _, prefix, name in self.sent_over]
+        return np.array([self._key(name) for name in names], np.uint64)
 
     @cached_property
     def changes(self) -> tuple[NodeChanges, LinkSegments]:
@@ -406,21 +440,25 @@ class Drawing:
             name = f"shadow/sent/{name}" if sent else f"shadow/{name}"
         return stream(self.seed, f"{self.streams}{name}")
 
-    def _path(self, process: Process, name: str) -> Path:
-        """Return the path of a stream, which continues after its last value."""
+    def _path(self, process: Process, name: str, rate: int = 1) -> Path:
+        """Return the path of a stream, which continues after its last value.
+
+        The stream has a value for every `rate`-th cycle.
+        """
         if name not in self.paths:
+            # Cycles with a value, and the number of each value in the complete path.
+            cycles = None if self.sent is None else self.sent[self.sent % rate == 0]
+            runs = None if cycles is None else cycles // rate
             if isinstance(process, Trace):
                 rows = self._table_rows(process.table)
-                path: Path = ReplayedPath(
-                    process.values, rows if self.sent is None else rows[self.sent]
-                )
+                if process.table.by == "time":
+                    rows = rows[::rate]
+                path: Path = ReplayedPath(process.values, rows if runs is None else rows[runs])
             else:
                 path = path_of(process, self._rng(name))
-                if self.sent is not None and not (
-                    name.startswith(OF_A_JOB) and independent(process)
-                ):
-                    # Sample all cycles and select those with a shadow.
-                    path = ReplayedPath(path.values(self.cycles), self.sent)
+                if runs is not None and not (name.startswith(OF_A_JOB) and independent(process)):
+                    # Sample all runs and select those with a shadow.
+                    path = ReplayedPath(path.values(-(-self.cycles // rate)), runs)
             self.paths[name] = path
         return self.paths[name]
 
@@ -467,32 +505,35 @@ class Drawing:
         for table, rows in self.rows.values():
             yield TraceStart(table.file, tuple(table.columns), int(rows[0]) + 1)
 
-    def _fill_executions(self, out: Ints) -> None:
+    def _fill_executions(self, out: Ints, at: int) -> None:
         """Sample the next execution times, one row per site."""
         pipeline = self.problem.pipeline
         factors: dict[str, Floats] = {}
-        for row, (task, node) in zip(out, self.sites, strict=True):
+        for row, (task, node), rate in zip(out, self.sites, self.site_rates, strict=True):
             scale = pipeline.tasks[task].scale
             if scale is not None and scale not in factors:
                 path = self._path(pipeline.scales[scale], f"scale/{scale}")
                 factors[scale] = path.values(len(row))
             process = pipeline.tasks[task].on[node].exec_ms
-            path = self._path(process, f"exec/{task}/{node}")
-            path.fill_ns(row, factors[scale] if scale is not None else None)
+            path = self._path(process, f"exec/{task}/{node}", rate)
+            self._fill(row, at, rate, path, factors[scale] if scale is not None else None)
 
-    def _fill_delays(self, out: Ints) -> None:
+    def _fill_delays(self, out: Ints, at: int) -> None:
         """Sample the next delays, one row per hop."""
         links = self.problem.fabric.links
-        for row, hop in zip(out, self.hops, strict=True):
-            self._path(links[hop[2]].delay_ms, f"delay/{_hop_name(hop)}").fill_ns(row)
+        for row, sent, rate in zip(out, self.sent_over, self.hop_rates, strict=True):
+            link, prefix, name = sent
+            path = self._path(links[link].delay_ms, f"{prefix}delay/{name}", rate)
+            self._fill(row, at, rate, path)
 
-    def _fill_extra(self, out: Ints) -> None:
+    def _fill_extra(self, out: Ints, at: int) -> None:
         """Sample the next extra delays, one row per layer."""
         row = 0
-        for hop in self.hops:
-            for ordinal, (process, count) in enumerate(self._added(hop[2])):
+        for (link, prefix, name), rate in zip(self.sent_over, self.hop_rates, strict=True):
+            for ordinal, (process, count) in enumerate(self._added(link)):
                 rows = out[row : row + count]
-                self._path(process, f"extra/{ordinal}/{_hop_name(hop)}").fill_ns(rows[-1])
+                path = self._path(process, f"{prefix}extra/{ordinal}/{name}", rate)
+                self._fill(rows[-1], at, rate, path)
                 if count > 1:
                     _split(rows)
                 row += count
@@ -501,8 +542,8 @@ class Drawing:
         """Return the hop and number of each layer of extra delay."""
         return tuple(
             (i, layer)
-            for i, hop in enumerate(self.hops)
-            for layer in range(sum(count for _, count in self._added(hop[2])))
+            for i, (link, *_) in enumerate(self.sent_over)
+            for layer in range(sum(count for _, count in self._added(link)))
         )
 
     def _added(self, name: str) -> list[tuple[Process, int]]:
@@ -638,6 +679,24 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
                 hops[flow.source, flow.target, link] = None
     # Always add the hops of states: cold and warm migrations then have the same realisation.
     return (*hops, *_state_hops(problem))
+
+
+def _forwards(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    """Yield sampled flows with the links between nodes of their targets, by flow, then by link."""
+    for flow in problem.pipeline.flows:
+        if not flow.sampled:
+            continue
+        hosts = {placement[flow.target] for placement in problem.candidates.values()}
+        for link in problem.fabric.links.values():
+            if {link.source, link.target} <= hosts:
+                yield flow.source, flow.target, link.name
+
+
+def _hop_rates(problem: Problem, hops: Sequence[tuple[str, str, str]]) -> list[int]:
+    """Return the cycles from one message of each hop to its next; 1 for states."""
+    pipeline = problem.pipeline
+    rates = {(one.source, one.target): pipeline.message_rate(one) for one in pipeline.flows}
+    return [rates.get((source, target), 1) for source, target, _ in hops]
 
 
 def _possible_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:

@@ -194,7 +194,8 @@ class Realisation:
     sites : tuple of (task, node)
         Rows of `exec_ns`.
     exec_ns : int64 array, shape (sites, N)
-        Execution time of each cycle's job, scale included.
+        Execution time of each cycle's job, scale included; 0 in cycles in which the task is not
+        due. The same holds for delays.
     hops : tuple of (source task, target task, link)
         Rows of `delay_ns` and `loss_keys`: a flow and a link that it uses in some candidate.
     delay_ns : int64 array, shape (hops, N)
@@ -215,6 +216,10 @@ class Realisation:
         First row of each replayed trace.
     streams : str
         Prefix of the names of the random streams.
+    forwards : tuple of (source task, target task, link)
+        A sampled flow, and a link over which a node forwards its messages after the target has
+        moved. Their rows of `delay_ns` and `loss_keys`, and their hop indices, follow those of
+        `hops`; the columns are the cycles that the messages carry.
     """
 
     scenario: str
@@ -233,6 +238,7 @@ class Realisation:
     phases: Mapping[str, Phase] = field(default_factory=dict)
     trace_starts: tuple[TraceStart, ...] = ()
     streams: str = ""
+    forwards: tuple[tuple[str, str, str], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "node_changes", NodeChanges.of(self.node_changes))

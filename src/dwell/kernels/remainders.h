@@ -79,12 +79,14 @@ bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {
     for (i64 task = 0; task < of.n_tasks; ++task) {
       const Job& job = s.job(cell, cycle, task);
       if (s.site(job).server != below.above) continue;
+      const Task& of_job = s.task(cell, task);
+      const bool runs = s.is_due(of_job, cycle);
       const i64 soonest_ns = std::max<i64>(s.soonest_ns[slot.candidate * s.n_tasks + task], 0);
       const i64 due_ns = later(of.release_ns[cycle], soonest_ns);
       const i64 next_ns = later(due_ns, of.period_ns);
-      if (cycle == last && next_ns < end_ns) return true;
-      const bool is_due = due_ns < end_ns && now < next_ns;
-      if (is_due && job.ready_ns < 0 && !slot.is_lost) return true;
+      if (cycle == last && next_ns < end_ns && s.is_due(of_job, cycle + 1)) return true;
+      const bool is_due = runs && due_ns < end_ns && now < next_ns;
+      if (is_due && job.ready_ns < 0 && slot.is_lost == kNothing) return true;
     }
   }
   return false;

@@ -20,6 +20,7 @@ using i8 = std::int8_t;
 using i16 = std::int16_t;
 using i32 = std::int32_t;
 using i64 = std::int64_t;
+using u32 = std::uint32_t;
 using u64 = std::uint64_t;
 using f64 = double;
 using Times = const i64*;
@@ -42,12 +43,13 @@ struct Crossing;  // of meter.cpp
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
   field(i64, has_shared) /* whether cells have servers in common */                              \
+  field(i64, has_rates) /* whether some tasks skip cycles, or flows are sampled */               \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
   field(i64, n_priced) /* columns of the outputs */                                              \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs keep all cycles, or only the ring's */                    \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
-  field(i64, n_held)                                                                             \
+  field(i64, n_held) field(i64, n_repeats)                                                       \
   field(i64, is_calendar) field(i64, day_bits) /* a day is 2^day_bits ns; see queue.h */         \
   field(i64, next_change)                                                                        \
   field(i64, pauses) /* whether a call ends when a decision is due */                            \
@@ -74,14 +76,29 @@ struct Crossing;  // of meter.cpp
   field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
+  field(i32, sampled_0) field(i32, n_sampled) /* in `sampled` */                                 \
+  field(i32, forward_0) field(i32, n_forwards) /* in `forwards` */                               \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
   field(i32, shadow) field(i32, parent)
 
+// A task runs in every `every`-th cycle from 0 on. `n_in` counts its waited inputs. The rates of
+// the sinks to which waited flows lead from it, its own if it is a sink, are in `sink_rates`.
 #define DWELL_TASK(field)                                                                        \
-  field(i64, offset_ns)                                                                          \
-  field(i32, n_in) field(i32, n_out) field(i32, out_0) /* in `outputs` */
+  field(i64, offset_ns) field(i64, every)                                                        \
+  field(i32, n_in) field(i32, n_out) field(i32, out_0) /* in `outputs` */                        \
+  field(i32, rate_0) field(i32, n_rates)
 
-#define DWELL_FLOW(field) field(i32, source) field(i32, target)
+// A flow carries a message in every `every`-th cycle.
+#define DWELL_FLOW(field)                                                                        \
+  field(i64, every) field(i32, source) field(i32, target) field(i32, is_sampled)
+
+// A sampled flow over a link from a site of its target to another site: the messages that a node
+// forwards after a move. Rows have the order of the flows, then of the links, of the file.
+#define DWELL_FORWARD(field)                                                                     \
+  field(i32, flow) field(i32, from_site) field(i32, to_site) field(i32, hop)
+
+// The lost attempts of a forward that will be sent again; `key` is the event of its arrival.
+#define DWELL_REPEAT(field) field(i64, key) field(i64, attempt)
 
 // A job occupies `need` of its server: cores, or threads that share the cores of a fair server, or
 // places of an accelerator. `threads` threads do its work. `own` is the row of its cell and server
@@ -168,7 +185,7 @@ struct Crossing;  // of meter.cpp
   field(i64, next) field(f64, beside_ns) field(i32, site)                    \
   field(i32, missing)
 
-// A cycle in flight. `live` counts its jobs and messages in flight.
+// A cycle in flight. `live` counts its jobs and messages in flight. `is_lost` is one of `Loss`.
 #define DWELL_SLOT(field)                                                                        \
   field(i64, cycle) field(i32, candidate) field(i32, pair) field(i32, live)                      \
   field(i32, sinks_left) field(i32, is_lost)
@@ -179,10 +196,10 @@ struct Crossing;  // of meter.cpp
   field(i64, ready_ns) field(i64, start_ns) field(i64, end_ns) field(i64, work_ns)               \
   field(i64, used_ns) field(i64, above_ns)
 
-// Metrics of cycles as known at the end of a window, or when a decision was due. `uncut_ms` is L95
-// without the limit `longest_ms` of the cell.
+// Metrics of cycles as known at the end of a window, or when a decision was due. `counted` cycles
+// are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell.
 #define DWELL_SEEN(field)                                                                        \
-  field(i64, first_cycle) field(i64, cycles) field(i64, missed)                                  \
+  field(i64, first_cycle) field(i64, cycles) field(i64, missed) field(i64, counted)              \
   field(f64, l95_ms) field(f64, uncut_ms)
 
 // Numbers by which a built-in policy with the estimator `profile` decides (rules.h): the policy's
@@ -310,6 +327,7 @@ struct Crossing;  // of meter.cpp
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)                            \
   row(Link, DWELL_LINK) row(Held, DWELL_HELD)                                                    \
+  row(Forward, DWELL_FORWARD) row(Repeat, DWELL_REPEAT)                                          \
   row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                                              \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
@@ -336,22 +354,25 @@ DWELL_ROWS(DWELL_STRUCT)
 // shapes.
 #define DWELL_TABLES(table)                                                                      \
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
-  table(i32, outputs) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
+  table(i32, outputs) table(i32, sampled) table(i32, sink_rates) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
-  table(Hop, hops) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
+  table(Hop, hops) table(Forward, forwards) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
   table(Change, changes) table(f64, work) table(f64, switching)               \
   table(i8, tiers) table(i16, stamps)                                                            \
   table(Site, sites) table(Server, servers) table(Quota, quotas) table(Link, links)              \
   table(Event, events) table(i32, following) table(i32, days) table(Held, held)                  \
+  table(Repeat, repeats)                                                                         \
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
-  table(f64, own_ns) table(i64, soonest_ns) table(i64, ages)                                     \
+  table(f64, own_ns) table(i64, soonest_ns) table(i64, ages) table(i64, values)                  \
+  table(i64, forwarded)                                                                          \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \
   table(Decided, decided) table(f64, priced)                                                     \
-  table(i64, shadow_bytes) table(Log, log) table(i8, log_outcome) table(i64, log_arrived)
+  table(i64, shadow_bytes) table(Log, log) table(i8, log_outcome) table(i64, log_arrived)        \
+  table(i64, log_taken)
 
 // clang-format on
 

@@ -93,6 +93,8 @@ class Tables(NamedTuple):
     tasks: Rows  # (tasks,)
     flows: Rows  # (flows,)
     outputs: NDArray[np.int32]  # flows out of each task, in the order of the file
+    sampled: NDArray[np.int32]  # sampled flows of each cell, in the order of the file
+    sink_rates: NDArray[np.int32]  # rates of the sinks that each task's outputs are waited for by
     cell_servers: NDArray[np.int32]  # servers of each cell's resources
     capacity: Floats  # cores, or places, of each of these servers
     nodes: Rows  # (nodes,)
@@ -101,6 +103,7 @@ class Tables(NamedTuple):
     back_ns: Ints  # (candidates,) time from a completion until the guard learns of it
     shadow_parts: NDArray[np.int8]  # (pairs of candidates, tasks)
     hops: Rows  # (hops,)
+    forwards: Rows  # (forwards,)
     layers: NDArray[np.uint64]  # (hops, layers) address of the extra delays, 0 for none
     segments: Rows  # (segments,)
     rates: Rows  # (segments,)
@@ -118,6 +121,7 @@ class Tables(NamedTuple):
     following: NDArray[np.int32]
     days: NDArray[np.int32]
     held: Rows  # messages that wait for others, or for their repeat; as many rows as events
+    repeats: Rows  # forwards that will be sent again; as many rows as events
     running: Rows  # per server a heap of running jobs by virtual finish
     waiting: Rows  # per server a heap of jobs that wait for cores
     dirty: NDArray[np.int32]  # servers to look after at the end of the event
@@ -128,6 +132,8 @@ class Tables(NamedTuple):
     own_ns: Floats  # (cells, resources of a cell) core-nanoseconds of completed own work
     soonest_ns: Ints  # (candidates, tasks) least time from release to readiness; -1 if unknown
     ages: Ints  # (W,) scratch: latency, or age if unfinished, of the cycles of a window
+    values: Ints  # (sites, flows) cycle of the newest message of a sampled input; -1 for none
+    forwarded: Ints  # (forwards,) newest cycle that was forwarded; -1 for none
     rule: Rows  # (1,), or empty if Python decides
     options: Rows  # (candidates,)
     shown: Floats  # (resources, candidates) last share under a candidate, kept while full; else 1
@@ -152,6 +158,7 @@ class Tables(NamedTuple):
     log: Rows  # (cells * L * tasks,), L being N or the slots (`logs_all`); or empty
     log_outcome: NDArray[np.int8]
     log_arrived: Ints  # (cells * L, flows), or empty
+    log_taken: Ints  # (cells * L, flows) cycle of each sampled message that a job took, or empty
 
     def addresses(self) -> NDArray[np.uint64]:
         """Return the address and length of every table.

@@ -9,11 +9,13 @@
 namespace dwell {
 
 // Features are constants at compile time, and unused features cost no time. `kQuotas`: some node
-// has a quota. `kPlain`: the simulation has one cell without a shadow, and logs no jobs.
-template <bool has_quotas, bool is_plain>
+// has a quota. `kPlain`: the simulation has one cell without a shadow, and logs no jobs. `kRates`:
+// some tasks skip cycles, or some flows are sampled.
+template <bool has_quotas, bool is_plain, bool has_rates>
 struct Simulation : Tables {
   static constexpr bool kQuotas = has_quotas;
   static constexpr bool kPlain = is_plain;
+  static constexpr bool kRates = has_rates;
 
   Queue queue;
   const i64 n_slots, n_tasks, n_flows, n_cycles;
@@ -45,6 +47,13 @@ struct Simulation : Tables {
   Server& server(const Site& site) const { return servers[site.server]; }
   Task& task(i64 cell, i64 local) const { return tasks[(kPlain ? 0 : cells[cell].task_0) + local]; }
   Flow& flow(i64 cell, i64 local) const { return flows[(kPlain ? 0 : cells[cell].flow_0) + local]; }
+
+  // Whether a task runs in a cycle, or a flow carries a message in it.
+  template <class Row>
+  static bool is_due(const Row& row, i64 cycle) {
+    // 32 bits hold every cycle, and their division is faster.
+    return !kRates || static_cast<u32>(cycle) % static_cast<u32>(row.every) == 0;
+  }
 
   // Place of a cycle in the outputs.
   i64 output(i64 cell, i64 cycle) const { return (kPlain ? 0 : cell * n_cycles) + cycle; }

@@ -1,5 +1,6 @@
 """The frozen domain objects: pipeline, fabric, candidates, metrics and decisions."""
 
+from dwell.model.chain import Chain
 from dwell.model.controller_settings import ControllerSettings
 from dwell.model.evolve import evolve
 from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
@@ -37,6 +38,7 @@ __all__ = [
     "REASONS",
     "Bursts",
     "Caps",
+    "Chain",
     "Constant",
     "ControllerSettings",
     "Decision",

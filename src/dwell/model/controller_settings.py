@@ -43,7 +43,7 @@ class ControllerSettings:
         "Cycles between two decisions, at most W.",
         DECIDE_CYCLES,
         default=None,
-        usual="W/4, rounded down, and at least 1",
+        usual="W/4, rounded down, then up to a multiple of the slowest sink's interval",
         digested="decision",
     )
     min_dwell: int | None = key(

@@ -55,7 +55,7 @@ def to_document(problem: Problem) -> Document:
         {
             "dwell": VERSION,
             "name": problem.name,
-            **_part("", pipeline, "tasks", "flows", "scales"),
+            **_part("", pipeline, "tasks", "flows", "scales", "chains"),
             "window_cycles": problem.window_cycles,
             "warmup_windows": problem.warmup_windows,
             "nodes": {name: _node(node) for name, node in fabric.nodes.items()},
@@ -65,6 +65,10 @@ def to_document(problem: Problem) -> Document:
             "scales": {
                 name: _process(f"scales.{name}", scale) for name, scale in pipeline.scales.items()
             },
+            "chains": {
+                name: _part(f"chains.{name}", chain) for name, chain in pipeline.chains.items()
+            }
+            or None,
             "candidates": {
                 name: relocated(placement, pipeline.tasks)
                 for name, placement in problem.candidates.items()

@@ -5,16 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, PERIOD_MS, TIME_MS, Bound, require
+from dwell.model.chain import Chain
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
 from dwell.model.process import Constant, Process
 from dwell.model.ros_topics import RosTopic
+from dwell.model.task_rates import rates_of
 
 #: Workers of a task on a node, and the task's default for each of its nodes.
 WORKERS = Bound(1, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
+EVERY = Bound(1, 10_000, whole=True)
 #: Largest deadline, in periods.
 LONGEST_DEADLINE = 64
 
@@ -78,7 +81,17 @@ class Task:
         default=None,
         tier="measured",
     )
-    offset_ms: float = key("Start of a source after the cycle's release, ms.", TIME_MS, default=0.0)
+    every: int | None = key(
+        "Cycles from one run to the next of a task without waited inputs.",
+        EVERY,
+        default=None,
+        usual="1, or the rate of its waited inputs",
+    )
+    offset_ms: float = key(
+        "Start after the cycle's release of a task without waited inputs, ms.",
+        TIME_MS,
+        default=0.0,
+    )
     start_ms: float = key(
         "Time that a new worker needs before its first job, ms.",
         TIME_MS,
@@ -139,6 +152,10 @@ class Flow:
         named="bytes",
         tier="first",
     )
+    sampled: bool = key(
+        "Whether the target does not wait for it, but takes the newest message that has arrived.",
+        default=False,
+    )
 
 
 @declared()
@@ -166,6 +183,10 @@ class Pipeline:
         default_factory=FrozenDict,
         tier="measured",
     )
+    chains: Mapping[str, Chain] = key(
+        "Chains of tasks whose data age is measured, by name.",
+        default_factory=FrozenDict,
+    )
     phase_ms: float | None = key(
         "Offset of all its releases, with their deadlines and windows, ms; less than P.",
         TIME_MS,
@@ -183,15 +204,15 @@ class Pipeline:
         require_names("tasks", self.tasks)
 
     def __repr__(self) -> str:
-        chains = [shortened(chain, " -> ") for chain in self.chains()]
+        ways = [shortened(way, " -> ") for way in self.ways()]
         return (
-            f"<Pipeline: {shortened(chains, '; ')}; period {self.period_ms:g} ms, "
+            f"<Pipeline: {shortened(ways, '; ')}; period {self.period_ms:g} ms, "
             f"deadline {self.deadline_ms:g} ms>"
         )
 
     def __str__(self) -> str:
-        """Return its flows as chains: ``a → b → d; c → b``."""
-        return "; ".join(" → ".join(chain) for chain in self.chains())
+        """Return its flows as ways: ``a → b → d; c → b``."""
+        return "; ".join(" → ".join(way) for way in self.ways())
 
     @property
     def first_release_ms(self) -> float:
@@ -217,18 +238,74 @@ class Pipeline:
         """Flows into a task."""
         return tuple(flow for flow in self.flows if flow.target == task)
 
+    def waited(self, task: str) -> tuple[Flow, ...]:
+        """Flows into a task that it waits for: all except sampled flows."""
+        return tuple(flow for flow in self.inputs(task) if not flow.sampled)
+
     def outputs(self, task: str) -> tuple[Flow, ...]:
         """Flows out of a task."""
         return tuple(flow for flow in self.flows if flow.source == task)
+
+    @property
+    def sinks(self) -> tuple[str, ...]:
+        """Tasks without outputs."""
+        return tuple(name for name in self.tasks if not self.outputs(name))
+
+    @property
+    def rates(self) -> dict[str, int]:
+        """Cycles from one run of each task to its next."""
+        return rates_of(self.tasks, self.flows)
+
+    @property
+    def has_rates(self) -> bool:
+        """Whether some task does not run in each cycle, or some flow is sampled."""
+        every = (task.every or 1 for task in self.tasks.values())
+        return any(flow.sampled for flow in self.flows) or max(every) > 1
+
+    @property
+    def sink_rates(self) -> dict[str, tuple[int, ...]]:
+        """Rates of the sinks to which waited flows lead from each task, or of the task if a sink.
+
+        Only tasks with such a sink determine the latency and the outcome of a cycle.
+        """
+        rates, found = self.rates, dict[str, set[int]]()
+        for name in reversed(self.topological()):
+            outputs = self.outputs(name)
+            waited = [found[flow.target] for flow in outputs if not flow.sampled]
+            found[name] = set().union(*waited) if outputs else {rates[name]}
+        return {name: tuple(sorted(found[name])) for name in self.tasks}
+
+    @property
+    def sink_cycles(self) -> int:
+        """Cycles from one run to the next of the slowest sink."""
+        if not any(task.every for task in self.tasks.values()):
+            return 1
+        rates = self.rates
+        return max(rates[name] for name in self.sinks)
+
+    @property
+    def has_idle_cycles(self) -> bool:
+        """Whether no sink is due in some cycles."""
+        rates = self.rates
+        return min(rates[name] for name in self.sinks) > 1
+
+    def message_rate(self, flow: Flow) -> int:
+        """Cycles from one message of a flow to its next.
+
+        A waited flow has messages in the cycles in which its target runs, a sampled flow in the
+        cycles in which its source runs.
+        """
+        return self.rates[flow.source if flow.sampled else flow.target]
 
     def diverging(self, active: Mapping[str, str], other: Mapping[str, str]) -> frozenset[str]:
         """Return the tasks on another node under `other`, and all tasks downstream of them.
 
         A shadow through `other` runs these tasks and shares the rest with the cycle under `active`.
+        Sampled flows do not count.
         """
         found: set[str] = set()
         for name in self.topological():
-            behind = any(flow.source in found for flow in self.inputs(name))
+            behind = any(flow.source in found for flow in self.waited(name))
             if active[name] != other[name] or behind:
                 found.add(name)
         return frozenset(found)
@@ -244,15 +321,15 @@ class Pipeline:
                     order.append(flow.target)
         return tuple(order)
 
-    def chains(self) -> tuple[tuple[str, ...], ...]:
+    def ways(self) -> tuple[tuple[str, ...], ...]:
         """Return paths that contain every flow exactly once and every task at least once."""
         left = {name: [flow.target for flow in self.outputs(name)] for name in self.tasks}
         found: list[tuple[str, ...]] = []
         for name in self.topological():
             alone = not self.inputs(name) and not self.outputs(name)
             while left[name] or alone:
-                chain, alone = [name], False
-                while left[chain[-1]]:
-                    chain.append(left[chain[-1]].pop(0))
-                found.append(tuple(chain))
+                way, alone = [name], False
+                while left[way[-1]]:
+                    way.append(left[way[-1]].pop(0))
+                found.append(tuple(way))
         return tuple(found)

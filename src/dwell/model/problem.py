@@ -87,9 +87,9 @@ class Problem(Displayed):
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
         self.live.require_in_time(self.pipeline.deadline_ms)
-        every, width = self.decide_cycles, self.window_cycles
+        every, width = self.controller.decide_cycles, self.window_cycles
         bound = f"at most window_cycles = {width}; lower decide_cycles, or raise window_cycles"
-        require(every <= width, "controller.decide_cycles", every, bound)
+        require(every is None or every <= width, "controller.decide_cycles", every, bound)
         phased = self.pipeline.first_release_ms > 0 and self.live.release == "frames"
         bound = "timer in a cell with a phase_ms, which a camera's frames do not keep"
         require(not phased, "live.release", self.live.release, bound)
@@ -99,6 +99,7 @@ class Problem(Displayed):
         faults = [*find_faults(self.parts), *self._unplaced()]
         if faults:
             raise ProblemError(faults)
+        self._require_due_sinks()
 
     def __repr__(self) -> str:
         """Return a summary of its parts; `dwell.model.document` has all of it."""
@@ -117,6 +118,21 @@ class Problem(Displayed):
                 f"{controller.estimator or 'its usual estimator'}, begins with {self.initial}>",
             )
         )
+
+    def _require_due_sinks(self) -> None:
+        """Refuse windows in which a sink never runs, and features that do not support rates."""
+        rates = self.pipeline.rates
+        slowest = max(self.pipeline.sinks, key=lambda name: rates[name])
+        bound = f"at least {rates[slowest]}, so that {slowest} runs in each window"
+        holds = rates[slowest] <= self.window_cycles
+        require(holds, "window_cycles", self.window_cycles, bound)
+        framed = self.live.release == "frames" and max(rates.values()) > 1
+        bound = "timer in a cell with `every`, because each frame releases a cycle"
+        require(not framed, "live.release", self.live.release, bound)
+        names = list(self.controller.fallbacks)
+        guarded = bool(names) and self.pipeline.has_idle_cycles
+        bound = "empty, because the guard does not support cycles in which no sink runs"
+        require(not guarded, "controller.fallbacks", names, bound)
 
     def _unplaced(self) -> list[Fault]:
         """Return faults of placements without an anchored task, which only cell files may omit."""
@@ -137,6 +153,7 @@ class Problem(Displayed):
             tasks=pipeline.tasks,
             flows=[(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
             scales=pipeline.scales,
+            chains=pipeline.chains,
             candidates=self.candidates,
             scenarios={
                 name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
@@ -212,7 +229,10 @@ class Problem(Displayed):
     def decide_cycles(self) -> int:
         """Cycles between two decisions."""
         given = self.controller.decide_cycles
-        return max(self.window_cycles // 4, 1) if given is None else given
+        if given is not None:
+            return given
+        interval = self.pipeline.sink_cycles
+        return max(-(-(self.window_cycles // 4) // interval), 1) * interval
 
     @property
     def decisions_per_window(self) -> float:

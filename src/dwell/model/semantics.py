@@ -16,6 +16,7 @@ from graphlib import CycleError, TopologicalSorter
 from dwell.errors import Fault
 from dwell.model import table_columns
 from dwell.model.bounds import CLASS_PATH, shown
+from dwell.model.chain import Chain, chain_faults
 from dwell.model.controller_settings import ControllerSettings
 from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
@@ -28,6 +29,7 @@ from dwell.model.scenario import (
     LinkDisturbance,
     NodeDisturbance,
 )
+from dwell.model.task_rates import rate_faults
 
 # Names become columns, file names and keys of messages.
 NAME = re.compile(r"\w[\w.+:-]*(?: [\w.+:-]+)*")
@@ -65,6 +67,7 @@ class CellParts:
     tasks: Mapping[str, Task | None] = field(default_factory=dict)
     flows: Sequence[tuple[str, Flow]] = ()
     scales: Collection[str] = ()
+    chains: Mapping[str, Chain] = field(default_factory=dict)
     candidates: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     broken_candidates: Iterable[str] = ()
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
@@ -109,6 +112,7 @@ def find_faults(parts: CellParts) -> list[Fault]:
         *_links(parts),
         *_tasks(parts),
         *_flows(parts),
+        *_chains(parts),
         *_candidates(parts),
         *_scenarios(parts),
         *_objective(parts),
@@ -166,6 +170,7 @@ def _names(parts: CellParts) -> Iterator[Fault]:
         "nodes": parts.nodes,
         "tasks": parts.tasks,
         "scales": parts.scales,
+        "chains": parts.chains,
         "candidates": parts.candidates,
         "scenarios": parts.scenarios,
     }
@@ -215,7 +220,7 @@ def _links(parts: CellParts) -> Iterator[Fault]:
 def _tasks(parts: CellParts) -> Iterator[Fault]:
     if not parts.tasks:
         yield Fault("tasks", "none is declared; a pipeline needs at least one task")
-    targets = {flow.target for _, flow in parts.flows}
+    targets = {flow.target for _, flow in parts.flows if not flow.sampled}
     for name, task in parts.tasks.items():
         if task is None:
             continue
@@ -225,7 +230,8 @@ def _tasks(parts: CellParts) -> Iterator[Fault]:
         if task.offset_ms and name in targets:
             yield Fault(
                 f"{path}.offset_ms",
-                f"{task.offset_ms:g} on a task with inputs; only a source has an offset: remove it",
+                f"{task.offset_ms:g} on a task that waits for inputs; only a task without waited "
+                "inputs has an offset: remove it",
             )
         for node_name, execution in task.on.items():
             yield from _unknown(f"{path}.on.{node_name}", "node", node_name, parts.nodes)
@@ -250,10 +256,33 @@ def _flows(parts: CellParts) -> Iterator[Fault]:
             again = f"flow {flow.source} -> {flow.target} is declared again"
             yield Fault(path, f"{again} (first at {seen[pair]}); keep one")
         seen.setdefault(pair, path)
-    loop = _cycle([flow for _, flow in parts.flows])
-    if loop:
-        walk = " -> ".join((*loop, loop[0]))
-        yield Fault("flows", f"the cycle {walk} never starts; remove one of these flows")
+    flows = [flow for _, flow in parts.flows]
+    loop = _cycle(flows)
+    if not loop:
+        yield from _rates(parts, flows)
+        return
+    walk = " -> ".join((*loop, loop[0]))
+    links = {*zip(loop, (*loop[1:], loop[0]), strict=True)}
+    if any(flow.sampled and (flow.source, flow.target) in links for flow in flows):
+        message = f"the loop {walk} has a sampled flow; loops are not supported, remove this flow"
+    else:
+        message = f"the cycle {walk} never starts; remove one of these flows"
+    yield Fault("flows", message)
+
+
+def _rates(parts: CellParts, flows: Sequence[Flow]) -> Iterator[Fault]:
+    """Yield the faults of the rates of tasks, if all tasks and flows are known."""
+    tasks = {name: task for name, task in parts.tasks.items() if task is not None}
+    ends = {name for flow in flows for name in (flow.source, flow.target)}
+    if len(tasks) == len(parts.tasks) and ends <= tasks.keys():
+        yield from rate_faults(tasks, flows)
+
+
+def _chains(parts: CellParts) -> Iterator[Fault]:
+    for name, chain in parts.chains.items():
+        yield from _unknown(f"chains.{name}.from", "task", chain.source, parts.tasks)
+        yield from _unknown(f"chains.{name}.to", "task", chain.target, parts.tasks)
+    yield from chain_faults(parts.chains, parts.tasks, [flow for _, flow in parts.flows])
 
 
 def _cycle(flows: Sequence[Flow]) -> list[str]:
@@ -472,7 +501,8 @@ def _columns(parts: CellParts) -> Iterator[Fault]:
         for kind in node.accelerators if node is not None else ():
             if message := bad_name(kind):
                 yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
-    yield from table_columns.clash_faults(resources_of(parts.nodes), list(parts.candidates))
+    resources, chains = resources_of(parts.nodes), list(parts.chains)
+    yield from table_columns.clash_faults(resources, list(parts.candidates), chains)
 
 
 def too_many_shadows(fraction: float, candidates: int) -> str:

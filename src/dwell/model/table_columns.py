@@ -1,7 +1,8 @@
 """Declarations of the columns of all tables.
 
 A `Column` declares name, type, unit and the meaning of null. A table may have a column for each
-resource, each candidate, or each pair of them; `clash_faults` finds equal names among them.
+resource, each candidate, each pair of them, or each chain; `clash_faults` finds equal names among
+them.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ Feature: TypeAlias = Literal["live", "shadows", "support", "fleet", "between"]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table, or one for each resource or candidate.
+    """A column of a table, or one for each resource, candidate or chain.
 
     Parameters
     ----------
     name : str
-        With ``{resource}`` and ``{candidate}`` for a column per resource or candidate.
+        With ``{resource}``, ``{candidate}`` or ``{chain}`` for a column per resource, candidate
+        or chain.
     kind : str
         A type of Polars, or the kind of its names.
     sentence : str
@@ -159,6 +161,17 @@ WINDOWS = (
         null=UNMEASURED,
     ),
     Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),
+    Column(
+        "age_l95_{chain}",
+        "Float64",
+        "L95 of a chain's data age over the actuations of its cycles; infinite without any.",
+        "ms",
+    ),
+    Column(
+        "age_missed_{chain}",
+        "Float64",
+        "Share of these actuations whose age is over `max_age_ms`; 1 without any.",
+    ),
     Column("overtaken", "Int64", "Its cycles that completed after a later cycle.", is_new=True),
     Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
     Column("shadow_bytes", "Int64", "Bytes of shadows on links.", "bytes", of=SHADOWS),
@@ -349,11 +362,12 @@ TEMPLATES: Mapping[str, Sequence[str]] = {
 
 
 class NamedColumn(NamedTuple):
-    """A column of one cell: its name, and the resource and the candidate in it, if any."""
+    """A column of one cell: its name, and the resource, candidate or chain in it, if any."""
 
     name: str
     resource: Resource | None
     candidate: str
+    chain: str = ""
 
     @property
     def of(self) -> str:
@@ -361,11 +375,15 @@ class NamedColumn(NamedTuple):
         names = [] if self.resource is None else [self.resource.described]
         if self.candidate:
             names.append(f"candidate {self.candidate}")
+        if self.chain:
+            names.append(f"chain {self.chain}")
         return ", ".join(names) or "every cell"
 
     @property
     def path(self) -> str:
-        """Path in a cell file of the candidate, or else the resource, in its name."""
+        """Path in a cell file of the chain, the candidate, or the resource in its name."""
+        if self.chain:
+            return f"chains.{self.chain}"
         if self.candidate or self.resource is None:
             return f"candidates.{self.candidate}"
         return self.resource.path
@@ -379,9 +397,16 @@ def those_with(features: Collection[Feature], columns: Iterable[Column]) -> Iter
 
 
 def columns_of(
-    template: str, resources: Iterable[Resource], candidates: Iterable[str]
+    template: str,
+    resources: Iterable[Resource],
+    candidates: Iterable[str],
+    chains: Iterable[str] = (),
 ) -> Iterator[NamedColumn]:
     """Yield the columns that a declaration is for a cell: all candidates of a resource, then on."""
+    if "{chain}" in template:
+        for chain in chains:
+            yield NamedColumn(template.format(chain=chain), None, "", chain)
+        return
     of_resources = list(resources) if "{resource}" in template else [None]
     of_candidates = list(candidates) if "{candidate}" in template else [""]
     for resource, candidate in itertools.product(of_resources, of_candidates):
@@ -389,7 +414,9 @@ def columns_of(
         yield NamedColumn(name, resource, candidate)
 
 
-def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> Iterator[Fault]:
+def clash_faults(
+    resources: Iterable[Resource], candidates: Sequence[str], chains: Sequence[str] = ()
+) -> Iterator[Fault]:
     """Yield a fault for every two resources, or columns of a table, that would have one name."""
     known: dict[str, Resource] = {}
     for resource in resources:
@@ -404,7 +431,7 @@ def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> It
         taken: dict[str, NamedColumn] = {}
         # Fixed columns first: a clash with a fixed column is a fault of the cell's name.
         for template in sorted(templates, key=lambda one: "{" in one):
-            for column in columns_of(template, known.values(), candidates):
+            for column in columns_of(template, known.values(), candidates, chains):
                 one = taken.setdefault(column.name, column)
                 if one is not column:
                     yield Fault(
@@ -415,7 +442,9 @@ def clash_faults(resources: Iterable[Resource], candidates: Sequence[str]) -> It
 
 
 @cache
-def require_apart(resources: tuple[Resource, ...], candidates: tuple[str, ...]) -> None:
+def require_apart(
+    resources: tuple[Resource, ...], candidates: tuple[str, ...], chains: tuple[str, ...] = ()
+) -> None:
     """Raise a ProblemError with all names of a cell that would give two columns the same name."""
-    if faults := list(clash_faults(resources, candidates)):
+    if faults := list(clash_faults(resources, candidates, chains)):
         raise ProblemError(faults)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = 3
 
 #: Outcomes of a cycle or a job, in the order of the kernels' codes.
-OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied")
+OUTCOMES = ("in_flight", "done", "dropped", "replaced", "node_down", "not_applied", "idle")
 OUTCOME_SENTENCES: Mapping[str, str] = {
     "done": "it was completed",
     "dropped": "a message or an input was lost",
@@ -31,6 +31,7 @@ OUTCOME_SENTENCES: Mapping[str, str] = {
     "node_down": "a node was down",
     "not_applied": "its command was ready, and the actuator raised",
     "in_flight": "unfinished at the end",
+    "idle": "no sink was due",
 }
 #: Explanation of each reason of a decision.
 REASON_SENTENCES: Mapping[Reason, str] = {
@@ -139,7 +140,7 @@ def _columns(
     resources = problem.fabric.resources.values()
     for column in those_with(features, TABLES[table].columns):
         kind: str | list[str] = names.get(column.kind) or column.kind
-        for one in columns_of(column.name, resources, names["candidate"]):
+        for one in columns_of(column.name, resources, names["candidate"], problem.pipeline.chains):
             yield one.name, column, kind
 
 

@@ -38,7 +38,7 @@ from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
 #: Columns of the kernel's table `seen`.
-SEEN = "first_cycle", "cycles", "missed", "l95_ms", "uncut_ms"
+SEEN = "first_cycle", "cycles", "missed", "counted", "l95_ms", "uncut_ms"
 
 
 def simulate(
@@ -103,7 +103,8 @@ def simulate_realisation(
         Whether Python decides after every window, even if the kernel could; the Run is the same.
     """
     _check_fit(problem, realisation)
-    require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates))
+    chains = tuple(problem.pipeline.chains)
+    require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates), chains)
     asked = problem, realisation, policy, estimator, jobs, guard, by_window
     # Simulate without shadows first, which is faster, and again with shadows only if the guard
     # wants probes. Both give the same up to the first probe.
@@ -211,7 +212,7 @@ def play_cells(
     whole = lay_out(
         [(cell.problem, cell.realisation) for cell in cells],
         shared=shared,
-        log_jobs=jobs,
+        log_jobs=jobs or any(cell.problem.pipeline.chains for cell in cells),
         log_windows=any(cell.controller.learns for cell in cells),
         decides=True,
         shadows=[
@@ -372,9 +373,9 @@ class SimulatedStamper:
         return max(due_ns, self.release_ns.item(boundary) + self.grace_ns)
 
     def leave_to_kernel(self) -> None:
-        """Let the kernel decide if it implements the controller's rule."""
+        """Let the kernel decide if it implements the controller's rule; idle cycles it does not."""
         plain = plain_rule(self.controller)
-        if plain is None:
+        if plain is None or self.controller.problem.pipeline.has_idle_cycles:
             return
         numbers = {
             **plain.numbers,
@@ -402,7 +403,7 @@ class SimulatedStamper:
         self.controller.looked = LookedAt(self._window_of(boundary - 1), boundary - 1, cycles)
         if len(self.decided):
             self.course.move(self.names[self.decided.item(0)])
-        elif self.host_is_down(close_ns):
+        elif self.host_is_down(close_ns) or not self.seen[3].item(0, index):
             self.controller.miss()
             if not self.looks:
                 self.metrics.append((None, None, None))
@@ -435,8 +436,8 @@ class SimulatedStamper:
         if self.evidence is not None:
             first = boundary - self.every
             controller.learn(partial(self.evidence, first, boundary, close_ns))
-        _, cycles, missed, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
-        seen = l95_ms, missed / cycles, uncut_ms
+        _, _, missed, counted, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
+        seen = l95_ms, missed / counted, uncut_ms
         shares = self.shares[0, index]
         if self.looks:
             proposal = controller.propose_on(*seen, shares[1], recent=shares[0])

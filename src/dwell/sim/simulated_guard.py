@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from itertools import repeat, zip_longest
+from itertools import permutations, repeat, zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
 from dwell.kernels.rows import Row
 from dwell.model import Problem
 from dwell.model.instants import EVIDENCE_NS, HORIZON_NS, NEVER_NS
+from dwell.model.number_arrays import Ints
 
 
 class SimulatedGuard:
@@ -142,12 +143,13 @@ class SimulatedGuard:
 
         Without orders, the order and the repetition of events have no effect.
         """
-        guard, stamps = self.guard, self.arrays.tables.stamps
+        guard = self.guard
         stop = self._released(now)
         first = self._first_to_tell(stop, now)
         guard.passed(max(first - self._told, 0))
+        stamps = self._sent(first, stop)
         for cycle in range(max(first, self._told), stop):
-            at_ns, (own, *shadows) = int(self.release_ns[cycle]), stamps[:, cycle].tolist()
+            at_ns, (own, *shadows) = int(self.release_ns[cycle]), stamps[:, cycle - first].tolist()
             if self.names[own] != guard.placement:
                 guard.adopt(self.names[own])
             guard.sent(cycle, at_ns, self.names[own])
@@ -155,11 +157,11 @@ class SimulatedGuard:
                 if code >= 0:
                     guard.failures.released(self.names[code], cycle, at_ns)
         for row, i in np.argwhere(self._heard_ns(first, stop) <= now).tolist():
-            cycle, candidate = first + i, self.names[stamps[row, first + i]]
+            cycle, code = first + i, stamps.item(row, i)
             if row == 0:
-                guard.arrived(cycle, now, candidate)
-            else:
-                guard.failures.completed(candidate, cycle)
+                guard.arrived(cycle, now, self.names[code])
+            elif code >= 0:
+                guard.failures.completed(self.names[code], cycle)
         self._told, self._told_ns = stop, now
 
     def _first_to_tell(self, stop: int, now: int) -> int:
@@ -169,7 +171,7 @@ class SimulatedGuard:
         same candidate.
         """
         oldest = self._released(now - max(EVIDENCE_NS, self.guard.patience_ns))
-        stamps = self.arrays.tables.stamps[:, oldest:stop]
+        stamps = self._sent(oldest, stop)
         heard = self._heard_ns(oldest, stop) <= now
         own = np.arange(len(stamps))[:, np.newaxis] == 0
         first = stop
@@ -179,6 +181,38 @@ class SimulatedGuard:
             matter = completed if len(completed) else missing
             first = min([first, *(oldest + matter).tolist()])
         return first
+
+    def _sent(self, first: int, stop: int) -> NDArray[np.int16]:
+        """Return the candidates of cycles and of the shadows that count, -1 for none."""
+        stamps = self.arrays.tables.stamps[:, first:stop]
+        if len(stamps) == 1 or not self._rates_apart:
+            return stamps
+        own, shadows = stamps
+        return np.stack((own, np.where(self._counts(first, stop), shadows, -1)))
+
+    def _counts(self, first: int, stop: int) -> NDArray[np.bool_]:
+        """Return whether the shadow of each cycle counts, if it has one."""
+        own, shadows = self.arrays.tables.stamps[:, first:stop]
+        cycles, counts = np.arange(first, first + len(own)), np.ones(len(own), np.bool_)
+        for (active, other), rates in self._rates_apart.items():
+            mine = (own == active) & (shadows == other)
+            counts[mine] = (cycles[mine] % rates == 0).any(axis=0)
+        return counts
+
+    @cached_property
+    def _rates_apart(self) -> dict[tuple[int, int], Ints]:
+        """Rates of the tasks that are apart, by active and other candidate; shape (n, 1).
+
+        A shadow counts only in cycles in which such a task is due. Pairs whose shadows all count
+        are left out.
+        """
+        pipeline, found = self.problem.pipeline, {}
+        placed, rates = list(self.problem.candidates.values()), pipeline.rates
+        for (i, active), (j, other) in permutations(enumerate(placed), 2):
+            apart = {rates[task] for task in pipeline.diverging(active, other)}
+            if apart and 1 not in apart:
+                found[i, j] = np.array(sorted(apart), np.int64)[:, np.newaxis]
+        return found
 
     def _released(self, now: int) -> int:
         """Return the number of cycles released before an instant."""
@@ -212,10 +246,12 @@ class SimulatedGuard:
         first = max(told - MOST_OPEN, 0)
         cycles = np.arange(first, stop)
         release_ns, heard_ns = self.release_ns[first:stop], self._heard_ns(first, stop)[1]
-        new = (heard_ns <= now) & ((heard_ns > self._probed_ns) | (cycles >= told))
+        counts = self._counts(first, stop)
+        new = (heard_ns <= now) & ((heard_ns > self._probed_ns) | (cycles >= told)) & counts
         # At equal times completions precede releases, unless the completed cycle is released then.
         after = np.where(heard_ns == release_ns, 2, 0)
-        sent = zip(release_ns[told - first :].tolist(), repeat(1), range(told, stop))
+        known = cycles[told - first :][counts[told - first :]]
+        sent = zip(self.release_ns[known].tolist(), repeat(1), known.tolist(), strict=False)
         completed = zip(
             *(column[new].tolist() for column in (heard_ns, after, cycles)), strict=True
         )

@@ -13,13 +13,15 @@ from numpy.typing import NDArray
 
 from dwell.control import Controller, final_l95_ms, moved_shares, overtaken_cycles, seen_costs
 from dwell.kernels.arrays import CellArrays
+from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
-from dwell.model import REASONS, Problem
+from dwell.model import REASONS, Chain, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
+from dwell.sim.chain_ages import age_l95_ms, age_missed, chain_ages_ns
 
 if TYPE_CHECKING:
     import polars as pl
@@ -127,6 +129,20 @@ class PlayedRealisation:
         return window_close_ns(self.problem, release_ns[beyond - 1], release_ns[beyond])
 
     @cached_property
+    def idle(self) -> NDArray[np.bool_] | None:
+        """Whether no sink is due in each cycle; None if a sink is due in all."""
+        if not self.problem.pipeline.has_idle_cycles:
+            return None
+        idle: NDArray[np.bool_] = self.arrays.tables.outcome[0] == CycleOutcome.IDLE
+        return idle
+
+    def share_of(self, cycles: NDArray[np.bool_]) -> Floats:
+        """Return the share of each window's cycles that are true, without idle cycles."""
+        windows = self.by_window(cycles)
+        share: Floats = windows.mean(axis=1)
+        return share if self.idle is None else windows.sum(axis=1) / self.seen["counted"]
+
+    @cached_property
     def overtaken(self) -> NDArray[np.bool_]:
         """Whether a later cycle had completed at the completion of each cycle."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
@@ -147,6 +163,8 @@ class PlayedRealisation:
         else:
             window, place = late.nonzero()
             missed[self.first[window] + place] = True
+        if self.idle is not None:
+            missed &= ~self.idle[: self.released]
         return missed
 
 
@@ -223,16 +241,47 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "warmup": np.arange(count) < problem.warmup_windows,
             "placement": Names(stamps[played.first], tuple(problem.candidates)),
             "mixed": mixed,
-            "l95_ms": lambda: final_l95_ms(played.by_window(played.arrays.tables.latency_ns[0])),
-            "violation_rate": lambda: played.by_window(played.missed).mean(axis=1),
+            "l95_ms": lambda: _final_l95_ms(played),
+            "violation_rate": lambda: played.share_of(played.missed),
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
+            **_age_columns(played),
             "overtaken": lambda: played.by_window(played.overtaken).sum(axis=1),
             **_shadow_columns(played),
         }
     )
+
+
+def _final_l95_ms(played: PlayedRealisation) -> Floats:
+    """Return L95 of every window by the final latencies, without idle cycles."""
+    latency_ns = played.by_window(played.arrays.tables.latency_ns[0])
+    if played.idle is None:
+        return final_l95_ms(latency_ns)
+    rows = zip(latency_ns, played.by_window(played.idle), strict=True)
+    return np.array([final_l95_ms(latency[~idle]) for latency, idle in rows])
+
+
+def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
+    """Return the L95 of each chain's data age, and the share over its bound."""
+    columns: dict[str, Callable[[], NDArray[np.generic]]] = {}
+    for name, chain in played.problem.pipeline.chains.items():
+        ages_ns = cache(partial(_ages_ns, played, chain))
+        columns[f"age_l95_{name}"] = partial(_on_ages, ages_ns, age_l95_ms)
+        over = partial(age_missed, max_age_ms=chain.max_age_ms)
+        columns[f"age_missed_{name}"] = partial(_on_ages, ages_ns, over)
+    return columns
+
+
+def _on_ages(ages_ns: Callable[[], Ints], metric: Callable[[Ints], Floats]) -> Floats:
+    return metric(ages_ns())
+
+
+def _ages_ns(played: PlayedRealisation, chain: Chain) -> Ints:
+    """Return a chain's data ages by window."""
+    pipeline, realisation = played.problem.pipeline, played.realisation
+    return played.by_window(chain_ages_ns(pipeline, chain, realisation, played.arrays))
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
@@ -260,11 +309,11 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
 
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     """Return the metrics of windows at their closes; NaN while the controller's node was down."""
-    tables, window_cycles = played.arrays.tables, played.problem.window_cycles
+    tables = played.arrays.tables
     if played.looks or played.by_kernel:
         seen = {
             "l95_ms": played.seen["l95_ms"],
-            "violation_rate": played.seen["missed"] / window_cycles,
+            "violation_rate": played.seen["missed"] / played.seen["counted"],
         }
         seen["cost"] = (
             _costs(played, seen) if played.looks else tables.decided["measured"][: len(played.seen)]
@@ -336,7 +385,7 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
         used = tables.look_shares[0, :count, 1, 0].T
         columns |= {
             "seen_l95_ms": looked["l95_ms"],
-            "seen_violation_rate": looked["missed"] / looked["cycles"],
+            "seen_violation_rate": looked["missed"] / looked["counted"],
             **dict(zip((f"u_{one}" for one in controller.resources), used, strict=False)),
         }
     # The kernel's estimates have no errors.
@@ -356,7 +405,7 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
     tasks = tuple(problem.pipeline.tasks)
     nodes = tuple(problem.fabric.nodes)
     cells = len(tables.cells)
-    log, outcome, _ = played.arrays.logs()
+    log, outcome, *_ = played.arrays.logs()
     # The sites of a shadow follow the sites of its cell, in the same order.
     site_node = np.array([nodes.index(node) for _, node in played.realisation.sites] * cells)
     site = tables.site_of - played.arrays.part.site_0

@@ -27,7 +27,7 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
     late_ns = tables.latency_ns[0, :last] > pipeline.deadline_ns
     cycles = first + np.flatnonzero(late_ns[first:])
-    logs, _, arrivals = arrays.logs()
+    logs, _, arrivals, _ = arrays.logs()
     log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_rows(pipeline)]
     stamps = tables.stamps[0, cycles]
     names = [*pipeline.tasks]

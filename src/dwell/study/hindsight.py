@@ -67,6 +67,15 @@ class _Alone:
         }
 
 
+def require_sinks(problem: Problem, what: str) -> None:
+    """Raise a SimulationError if no sink is due in some cycles, which `what` does not support."""
+    if problem.pipeline.has_idle_cycles:
+        raise SimulationError(
+            f"{what} do not support cell {problem.name!r}, because no sink is due in some of its "
+            "cycles; let a sink run in each cycle, or leave them out"
+        )
+
+
 class Hindsight:
     """Estimates every candidate by its metrics in the same cycles of its static run.
 
@@ -94,8 +103,9 @@ class Hindsight:
         Raises
         ------
         SimulationError
-            If the static run of a candidate is missing.
+            If the static run of a candidate is missing, or no sink is due in some cycles.
         """
+        require_sinks(problem, "estimates in hindsight")
         missing = [name for name in problem.candidates if name not in self._alone]
         if missing:
             raise SimulationError(

@@ -37,6 +37,7 @@ from dwell.model.number_arrays import Floats, Mask
 from dwell.model.window_close import window_close_ns
 from dwell.policies.registry import estimator_of
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
+from dwell.study.hindsight import require_sinks
 from dwell.study.oracle import expected_costs
 from dwell.study.script import Script, is_up
 from dwell.study.summary import mean_of, used_in
@@ -139,11 +140,12 @@ def references(problem: Problem, realisation: Realisation) -> References:
     Raises
     ------
     SimulationError
-        If the controller sees no window after the warm-up, or a candidate has the name of a
-        reference.
+        If the controller sees no window after the warm-up, a candidate has the name of a
+        reference, or no sink is due in some cycles.
     """
     from dwell.sim import simulate_realisation
 
+    require_sinks(problem, "references")
     names = tuple(problem.candidates)
     if taken := set(REFERENCES) & set(names):
         raise SimulationError(

@@ -186,7 +186,8 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
     """
     counts, decided, counted = _counting(run, problem.window_cycles)
     windows, decisions, cycles = (run.arrays(name) for name in ("windows", "decisions", "cycles"))
-    missed, final_ns = cycles["missed"][counted], cycles["latency_ns"][counted]
+    due = _due(cycles, counted, problem)
+    missed, final_ns = cycles["missed"][counted][due], cycles["latency_ns"][counted][due]
     latencies = Latencies.of(final_ns, problem.pipeline.deadline_ms)
     answer = _answer(windows, counts, missed)
     placed = windows.names("placement")[counts]
@@ -203,13 +204,13 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **_migrations(decisions, decided),
         **{SHARE_OF.format(candidate=name): share_of(those) for name, those in active.items()},
         "cost": answer["cost"],
-        **_unfinished(cycles.names("outcome")[counted]),
+        **_unfinished(cycles.names("outcome")[counted][due]),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
         **_actuator(cycles, counted, problem),
         **{f"{part}_ms": mean_of(cycles[f"{part}_ns"][counted]) / 1e6 for part in PARTS},
         LATENCIES: hashlib.blake2b(final_ns.data, digest_size=8).hexdigest(),
-        PLAYED: _played(final_ns, cycles.names("placement")[counted], used, problem),
+        PLAYED: _played(final_ns, cycles.names("placement")[counted][due], used, problem),
     }
     incumbent, cost = decisions.names("incumbent"), windows["cost"][counts]
     fractions = run.meta.get("shadow_fractions", {})
@@ -236,7 +237,16 @@ def answer_of(run: Run, problem: Problem) -> dict[str, float]:
         If the run has no window after its warm-up.
     """
     counts, _, counted = _counting(run, problem.window_cycles)
-    return _answer(run.arrays("windows"), counts, run.arrays("cycles")["missed"][counted])
+    cycles = run.arrays("cycles")
+    missed = cycles["missed"][counted][_due(cycles, counted, problem)]
+    return _answer(run.arrays("windows"), counts, missed)
+
+
+def _due(cycles: TableArrays, counted: slice, problem: Problem) -> Mask | slice:
+    """Return which of the counted cycles have a sink that is due."""
+    if not problem.pipeline.has_idle_cycles:
+        return slice(None)
+    return ~cycles.names("outcome")[counted].equal("idle")
 
 
 def _answer(windows: TableArrays, counts: Mask, missed: Mask) -> dict[str, float]:

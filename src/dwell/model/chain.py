@@ -1,0 +1,55 @@
+"""Chains: from a task whose data an actuation descends from, to the task that acts on it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING
+
+from dwell.errors import Fault
+from dwell.model.bounds import Bound
+from dwell.model.declaration import declared, key
+
+if TYPE_CHECKING:
+    from dwell.model.pipeline import Flow
+
+MAX_AGE_MS = Bound(0, above=True)
+
+
+@declared()
+class Chain:
+    """A chain of tasks, whose data age is measured at each completion of its last task."""
+
+    source: str = key("Task from whose releases the age counts.", named="from")
+    target: str = key("Task behind it, whose completions are the actuations.", named="to")
+    max_age_ms: float = key(
+        "Age beyond which an actuation counts in `age_missed_<chain>`, ms.",
+        MAX_AGE_MS,
+        default=math.inf,
+        usual="none",
+    )
+
+
+def chain_faults(
+    chains: Mapping[str, Chain], tasks: Iterable[str], flows: Iterable[Flow]
+) -> Iterator[Fault]:
+    """Yield the faults of chains between known tasks that no flows connect."""
+    known, all_flows = {*tasks}, list(flows)
+    for name, chain in chains.items():
+        if not {chain.source, chain.target} <= known:
+            continue
+        if chain.target not in behind(chain.source, all_flows):
+            yield Fault(
+                f"chains.{name}",
+                f"no flows lead from {chain.source} to {chain.target}; name a task behind "
+                f"{chain.source} as `to`",
+            )
+
+
+def behind(task: str, flows: Iterable[Flow]) -> set[str]:
+    """Return the tasks that flows lead to from a task, the task itself excluded."""
+    found, new, known = set[str](), {task}, list(flows)
+    while new:
+        new = {flow.target for flow in known if flow.source in new} - found
+        found |= new
+    return found

@@ -1,0 +1,63 @@
+"""Problems with several rates and sampled flows, made at random from problems without."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from random import Random
+
+from dwell.model import Flow, Problem
+from tests.cells.once import with_windows
+
+#: Rates of sources, of which several are multiples of another.
+RATES = 1, 1, 2, 3, 4, 6
+#: Share of the flows that are sampled.
+SAMPLED = 0.35
+
+
+def with_rates(problem: Problem, rng: Random, *, idle: bool = True) -> Problem:
+    """Let sources run in every n-th cycle, and sample some flows; windows have all sinks.
+
+    Without `idle` a sink runs in every cycle.
+    """
+    made = _with_rates(problem, rng)
+    while made.pipeline.has_idle_cycles and not idle:
+        made = _with_rates(problem, rng)
+    return made
+
+
+def _with_rates(problem: Problem, rng: Random) -> Problem:
+    pipeline = problem.pipeline
+    flows = [replace(flow, sampled=rng.random() < SAMPLED) for flow in pipeline.flows]
+    rates: dict[str, int] = {}
+    tasks = dict(pipeline.tasks)
+    for name in pipeline.topological():
+        task = tasks[name]
+        flows = waitable(name, flows, rates)
+        inputs = [rates[flow.source] for flow in flows if flow.target == name and not flow.sampled]
+        if not inputs:
+            rates[name] = rng.choice(RATES)
+            offset_ms = task.offset_ms or rng.choice([0.0, round(pipeline.period_ms / 2)])
+            tasks[name] = replace(task, every=rates[name], offset_ms=offset_ms)
+            continue
+        rates[name] = max(inputs)
+        stated = rates[name] if min(inputs) < max(inputs) or rng.random() < 0.2 else None
+        tasks[name] = replace(task, every=stated)
+    slowest = max(rate for name, rate in rates.items() if not pipeline.outputs(name))
+    width = max(problem.window_cycles, rng.choice([slowest, slowest, 2 * slowest]))
+    rated = replace(pipeline, tasks=tasks, flows=tuple(flows))
+    return replace(with_windows(problem, width), pipeline=rated)
+
+
+def waitable(name: str, flows: list[Flow], rates: dict[str, int]) -> list[Flow]:
+    """Sample those inputs of a task whose rate is no divisor or multiple of the others' rates."""
+    kept: set[int] = set()
+    result = []
+    for flow in flows:
+        if flow.target == name and not flow.sampled:
+            rate = rates[flow.source]
+            if all(rate % other == 0 or other % rate == 0 for other in kept):
+                kept.add(rate)
+            else:
+                flow = replace(flow, sampled=True)
+        result.append(flow)
+    return result

@@ -1,0 +1,74 @@
+"""Chains of a cell file: keys, faults, and the names of their columns."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from dwell.cellfile import from_document
+from dwell.errors import ProblemError
+from dwell.model import Chain
+from dwell.model.document import to_document
+from dwell.record import column_types
+
+CELL: dict[str, Any] = {
+    "dwell": 1,
+    "period_ms": 10,
+    "nodes": {"R": {"tier": "robot"}},
+    "tasks": {
+        name: {"on": {"R": {"exec_ms": 1}}} for name in ("camera", "detect", "imu", "control")
+    },
+    "flows": [
+        {"from": "camera", "to": "detect"},
+        {"from": "detect", "to": "control", "sampled": True},
+        {"from": "imu", "to": "control"},
+    ],
+    "candidates": {"LOC": {}},
+    "objective": {"weights": {}},
+}
+
+
+def cell(**chains: object) -> dict[str, Any]:
+    return {**CELL, "chains": chains}
+
+
+def faults(document: dict[str, Any]) -> list[str]:
+    with pytest.raises(ProblemError) as caught:
+        from_document(document)
+    return [str(fault) for fault in caught.value.faults]
+
+
+def test_a_chain_leads_over_flows_of_both_kinds() -> None:
+    problem = from_document(cell(see={"from": "camera", "to": "control", "max_age_ms": 150}))
+    assert problem.pipeline.chains == {"see": Chain("camera", "control", 150)}
+    assert from_document(to_document(problem)) == problem
+
+
+@pytest.mark.parametrize(
+    ("chain", "words"),
+    [
+        ({"from": "imu", "to": "detect"}, ["chains.see", "imu", "detect"]),
+        ({"from": "control", "to": "camera"}, ["chains.see", "control", "camera"]),
+        ({"from": "imu", "to": "imu"}, ["chains.see", "imu"]),
+        ({"from": "imus", "to": "control"}, ["chains.see.from", "'imus'", "'imu'"]),
+        ({"from": "imu", "to": "controls"}, ["chains.see.to", "'controls'", "'control'"]),
+        ({"from": "imu"}, ["chains.see.to", "missing"]),
+        ({"from": "imu", "to": "control", "max_age_ms": 0}, ["max_age_ms", "above 0"]),
+        ({"from": "imu", "to": "control", "least": 0}, ["chains.see.least"]),
+    ],
+)
+def test_a_bad_chain_is_one_fault(chain: dict[str, object], words: list[str]) -> None:
+    (fault,) = faults(cell(see=chain))
+    assert [word for word in words if word not in fault] == []
+
+
+def test_a_bad_name_of_a_chain_is_a_fault() -> None:
+    (fault,) = faults(cell(**{"a/b": {"from": "imu", "to": "control"}}))
+    assert fault.startswith("chains.a/b")
+
+
+def test_chains_have_columns_of_windows() -> None:
+    problem = from_document(cell(see={"from": "camera", "to": "control"}))
+    columns = [name for name in column_types("windows", problem) if name.startswith("age")]
+    assert columns == ["age_l95_see", "age_missed_see"]

@@ -1,0 +1,64 @@
+"""Which tasks are due and needed in a cycle, by the section "Several rates" of the page.
+
+Shares no code with `dwell.model` beyond the keys of tasks and flows.
+"""
+
+from __future__ import annotations
+
+from dwell.model import Flow, Pipeline, Placement
+
+
+class Rates:
+    """The rates of a pipeline's tasks and flows."""
+
+    def __init__(self, pipeline: Pipeline) -> None:
+        self.pipeline = pipeline
+        self.sources = [name for name in pipeline.tasks if not self.waited_inputs(name)]
+        self.sinks = [name for name in pipeline.tasks if not pipeline.outputs(name)]
+        self.of = {name: self.rate(name) for name in pipeline.tasks}
+        self.sinks_of = {name: self.behind(name) for name in pipeline.tasks}
+
+    def waited_inputs(self, task: str) -> list[Flow]:
+        return [flow for flow in self.pipeline.inputs(task) if not flow.sampled]
+
+    def sampled_inputs(self, task: str) -> list[Flow]:
+        return [flow for flow in self.pipeline.inputs(task) if flow.sampled]
+
+    def rate(self, task: str) -> int:
+        """Cycles from one run of a task to the next."""
+        waited = self.waited_inputs(task)
+        if waited:
+            return max(self.rate(flow.source) for flow in waited)
+        return self.pipeline.tasks[task].every or 1
+
+    def behind(self, task: str) -> set[str]:
+        """Return the sinks that a task leads to by waited flows."""
+        outputs = self.pipeline.outputs(task)
+        if not outputs:
+            return {task}
+        return {sink for f in outputs if not f.sampled for sink in self.behind(f.target)}
+
+    def is_due(self, task: str, cycle: int) -> bool:
+        return cycle % self.of[task] == 0
+
+    def due_sinks(self, cycle: int) -> list[str]:
+        return [sink for sink in self.sinks if self.is_due(sink, cycle)]
+
+    def is_needed(self, task: str, cycle: int) -> bool:
+        return any(self.is_due(sink, cycle) for sink in self.sinks_of[task])
+
+    def of_flow(self, flow: Flow) -> int:
+        return self.of[flow.source if flow.sampled else flow.target]
+
+    def carries(self, flow: Flow, cycle: int) -> bool:
+        """Whether a flow has a message of a cycle."""
+        return cycle % self.of_flow(flow) == 0
+
+    def apart(self, active: Placement, other: Placement) -> set[str]:
+        """Return the tasks that run on another node under `other`, or behind such a task."""
+
+        def is_apart(task: str) -> bool:
+            before = [flow.source for flow in self.waited_inputs(task)]
+            return active[task] != other[task] or any(is_apart(source) for source in before)
+
+        return {task for task in self.pipeline.tasks if is_apart(task)}
