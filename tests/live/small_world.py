@@ -23,6 +23,7 @@ from dwell.live.roles.stamper import Stamper, StamperState
 from dwell.live.roles.worker import Chore, Job, Worker
 from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.trust.signing import Seals
+from dwell.live.wire import channels
 from dwell.live.wire.keys import CONTROLLER, Keys
 from dwell.live.wire.messages import Accepted, Ask, Order, StageCounts, decode, encode
 from dwell.live.wire.transport import Arrival
@@ -432,7 +433,7 @@ class World:
 
     def sample(self, order: Order) -> Arrival:
         """An order as it arrives."""
-        return Arrival(self.keys.order(), encode(order))
+        return Arrival(self.keys.of(channels.ORDER), encode(order))
 
     def order(self, placement: str, *, run: int = 0, term: int = 0, controller: str = "me") -> str:
         """Order a placement; returns why it was refused, or nothing."""
@@ -446,7 +447,7 @@ class World:
         answers: list[bytes] = []
 
         def hear(sample: Arrival) -> None:
-            if sample.key == self.keys.accepted():
+            if sample.key == self.keys.of(channels.ACCEPTED):
                 answers.append(sample.payload)
 
         self.network.taps.append(hear)
@@ -469,7 +470,7 @@ class World:
 
     def ask(self, what: str, about: str = "") -> None:
         """Ask the controller as a person does."""
-        self.tell(self.keys.ask(), encode(Ask("me", what, about)))
+        self.tell(self.keys.of(channels.ASK), encode(Ask("me", what, about)))
 
     def tell(self, key: str, data: bytes) -> int:
         """Hand the controller a message; returns how many it complains of."""

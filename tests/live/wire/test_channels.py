@@ -12,8 +12,10 @@ from typing import Any
 import dwell
 from dwell.live.trust.acl import access_control
 from dwell.live.trust.permissions import senders, subjects
+from dwell.live.wire.channels import CHANNELS
+from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import encode
-from dwell.live.wire.wiring import wire
+from dwell.live.wire.wiring import roles, wire
 from dwell.model import Problem
 from tests.fuzz.targets import wholes
 from tests.live.small_world import Bench, Counting, World, stateful
@@ -52,15 +54,28 @@ def _subscriptions() -> dict[str, str]:
     """Return the key expressions of every process of the canonical cell."""
     problem = stateful(dwell.load("examples/canonical.yaml"), "planning", 100)
     world = World(problem, policy="dtp", stages={"planning": Counting})
-    roles = {who: one.worker if isinstance(one, Bench) else one for who, one in world.roles.items()}
+    members = {
+        who: one.worker if isinstance(one, Bench) else one for who, one in world.roles.items()
+    }
     return {
-        who: " ".join(sorted(role.subscriptions()))  # type: ignore[attr-defined]
-        for who, role in sorted(roles.items())
+        who: " ".join(sorted(member.subscriptions()))  # type: ignore[attr-defined]
+        for who, member in sorted(members.items())
     }
 
 
 def test_a_change_of_the_wire_is_intended() -> None:
     assert agreed() == json.loads(KEPT.read_text())
+
+
+def test_processes_subscribe_to_the_channels_of_their_kind() -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    subscribed: dict[str, set[str]] = {role.kind: set() for role in roles(problem)}
+    keys, found = Keys(problem.name), _subscriptions()
+    for role in roles(problem):
+        subscribed[role.kind] |= {keys.word(one) for one in found[role.who].split()}
+    for kind, words in subscribed.items():
+        expected = {word for word, channel in CHANNELS.items() if kind in channel.receivers}
+        assert words - {"beat", "beats", "relay"} == expected, kind
 
 
 if __name__ == "__main__":

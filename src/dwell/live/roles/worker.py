@@ -14,7 +14,8 @@ from dwell.live.roles.offsets import Offsets
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.roles.stage_counts import DROPPED, REPLACED, TAKEN, StageBook
 from dwell.live.stage import CellStage, Message
-from dwell.live.wire.keys import CONTROLLER, MAIN, SHADOW
+from dwell.live.wire import channels
+from dwell.live.wire.keys import MAIN, SHADOW
 from dwell.live.wire.messages import (
     Completion,
     Header,
@@ -294,14 +295,14 @@ class Worker:
         keys, node = self.place.keys, self.place.node
         yield from self.pulse.subscriptions()
         if self.shadow:
-            yield keys.inputs(self.task, node, SHADOW)
+            yield keys.of(channels.INPUT, self.task, node, SHADOW)
             return
-        yield keys.inputs(self.task, node, MAIN)
+        yield keys.of(channels.INPUT, self.task, node, MAIN)
         if self.is_sink:
-            yield keys.inputs(self.task, node, SHADOW)
+            yield keys.of(channels.INPUT, self.task, node, SHADOW)
         if self._stateful:
-            yield keys.snapshot(self.task, node)
-            yield keys.state(self.task, node)
+            yield keys.of(channels.SNAPSHOT, self.task, node)
+            yield keys.of(channels.STATE, self.task, node, "*")
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a message."""
@@ -369,7 +370,7 @@ class Worker:
         here = Hop(self.task, place.node, *times, inputs, warmup=self.warms_up)
         hops = (*job.hops(), here)
         ended = Completion(job.header.stamp, self.task, at_ns, outcome, hops, place.node)
-        place.put_twice(place.keys.ended(), ended)
+        place.send(channels.ENDED, ended)
 
     # -------------------------------------------------------------------------- state
 
@@ -380,7 +381,7 @@ class Worker:
 
     def _about_state(self, sample: Arrival) -> None:
         if "/snapshot/" in sample.key:
-            asked = self.place.read(sample, Snapshot, lambda _: CONTROLLER)
+            asked = self.place.read(channels.SNAPSHOT, sample)
             if asked.task == self.task and asked.node == self.place.node:
                 self._asked = asked
             elif asked.task == self.task and asked.to == self.place.node:
@@ -471,7 +472,7 @@ class Worker:
 
     def _say_restored(self) -> None:
         if self._restored is not None:
-            self.place.put(self.place.keys.restored(), self._restored)
+            self.place.send(channels.RESTORED, self._restored)
             self._restored = None
 
     def _send_state(self, chore: Chore, data: bytes) -> None:
@@ -483,7 +484,7 @@ class Worker:
         state = State(run, cycle, self.task, place.node, chore.number, self._cost_ns)
         header, lane = encode(state), lane_of(self._state_bytes)
         for node in chore.to:
-            key = place.keys.state(self.task, node, place.node)
+            key = place.keys.of(channels.STATE, self.task, node, place.node)
             place.transport.put(key, data, header, lane=lane)
 
     def _take_over(self, state: State, data: bytes) -> str:
@@ -693,7 +694,7 @@ class Worker:
                 reason = _too_long(f"its command of {len(data)}", longest)
                 self._failed(f"cycle {stamp.cycle}: {reason}")
             elif runs_here or not self._stateful:
-                place.transport.put(place.keys.command(self.task), data, head)
+                place.transport.put(place.keys.of(channels.COMMAND, self.task), data, head)
         elif job.shadow or runs_here:
             for target, node, to in destinations:
                 declared = self._output_bytes[target]
@@ -702,7 +703,7 @@ class Worker:
                     reason = _too_long(f"its output of {len(data)}", longest, "the flow's bytes")
                     self._failed(f"cycle {stamp.cycle}: {reason}")
                     continue
-                key = place.keys.inputs(target, node, to)
+                key = place.keys.of(channels.INPUT, target, node, to)
                 place.transport.put(key, data, head, lane=lane_of(declared))
                 if to == MAIN:
                     self.book.sent(stamp, f"{target}@{node}", len(data))
@@ -711,7 +712,7 @@ class Worker:
     def framed(self, now_ns: int) -> None:
         """Request a cycle from the stamper, because the source has a frame."""
         self._framed_ns = now_ns
-        self.place.transport.put(self.place.keys.frame(), b"")
+        self.place.transport.put(self.place.keys.of(channels.FRAME), b"")
 
     def no_frame(self, error: Exception) -> None:
         """Record that waiting for a frame has failed."""
