@@ -14,8 +14,9 @@ from dwell.live.local.linked_transport import LinkedTransport, target_of, withou
 from dwell.live.local.message_links import LinkEnds, LinkFile
 from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
-from dwell.live.wire.transport import Arrival, Lane, Receive
+from dwell.live.wire.transport import Arrival, Lane
 from dwell.model import Constant, Link, Normal
+from tests.live.direct_transport import DirectTransport
 from tests.live.transport.meshes import ZenohMesh, introduce
 from tests.waiting import wait_until
 
@@ -24,26 +25,6 @@ KEYS = Keys("cell")
 TO_E = KEYS.of(channels.INPUT, "perception", "E", "main")
 #: Of messages at once that are held in order by numbers.
 MANY = 50
-
-
-class Direct:
-    """A transport that hands every message to all who have subscribed, at once."""
-
-    def __init__(self) -> None:
-        self.receivers: list[Receive] = []
-        self.closed = False
-
-    def put(
-        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
-    ) -> None:
-        for receive in self.receivers:
-            receive(Arrival(key, bytes(payload), header))
-
-    def subscribe(self, key: str, receive: Receive) -> None:
-        self.receivers.append(receive)
-
-    def close(self) -> None:
-        self.closed = True
 
 
 @pytest.fixture
@@ -56,7 +37,7 @@ class Pair:
     """A sender on R1 and a receiver on E, and what has arrived there when."""
 
     def __init__(self, file: LinkFile) -> None:
-        carrier = Direct()
+        carrier = DirectTransport()
         self.sender = LinkedTransport(carrier, LinkEnds(file.path, "camera@R1", "R1"))
         self.receiver = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
         self.arrived: list[tuple[int, Arrival]] = []
@@ -161,7 +142,7 @@ def test_it_waits_for_a_link_that_retransmits(tmp_path: Path) -> None:
 def test_what_stays_on_its_node_meets_no_link(file: LinkFile) -> None:
     for source, target in itertools.permutations(NODES, 2):
         file.set(source, target, down=True)
-    carrier = Direct()
+    carrier = DirectTransport()
     here = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
     found: list[Arrival] = []
     here.subscribe("**", found.append)
