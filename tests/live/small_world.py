@@ -14,13 +14,15 @@ from dwell.live.host.agent import Agent
 from dwell.live.host.supervision import Supervisor
 from dwell.live.roles import role as role_module
 from dwell.live.roles.controlled_cell import ControlledCell, Recorder
+from dwell.live.roles.joins import Job
 from dwell.live.roles.recording import RunRecorder
 from dwell.live.roles.role import RolePlace
 from dwell.live.roles.run_rows import Resume, Rows, columns_of
 from dwell.live.roles.sink import Sink
 from dwell.live.roles.stage_counts import StageBook
 from dwell.live.roles.stamper import Stamper, StamperState
-from dwell.live.roles.worker import Chore, Job, Worker
+from dwell.live.roles.state_transfer import Chore
+from dwell.live.roles.worker import Worker
 from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.trust.signing import Seals
 from dwell.live.wire import channels
@@ -187,7 +189,7 @@ class MemoryRecorder:
 def queued(worker: Worker) -> tuple[int, int, list[int]]:
     """Return how many jobs, jobs of shadows, and inputs per join wait at a worker."""
     joins = [len(joins.waiting) for joins in worker._joins.values()]
-    return len(worker._jobs), len(worker._forked), joins
+    return len(worker._jobs), len(worker.transfer.forked), joins
 
 
 def forget_jobs(worker: Worker) -> bool:

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dwell.live.roles.worker import Chore
+from dwell.live.roles.state_transfer import Chore
 from dwell.live.stage import Message
 from dwell.live.wire import channels
 from dwell.live.wire.messages import Completion, Order, Stamp, State, encode
@@ -521,7 +521,7 @@ def test_rule_8_a_state_is_whole_after_a_migration_that_was_given_up(problem: Pr
     world.run(1_000)
     world.pin("SO")
     target = world.worker("planning@E")
-    while target.state_at < (0, 0):
+    while target.transfer.at < (0, 0):
         world.run(1)
     # It has the state, and follows; who would order the placement is gone.
     world.kill("controller@E")
@@ -539,7 +539,7 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     world = counting(problem, "SO")
     world.run(1_000)
     worker = world.worker("planning@E")
-    run, cycle = worker.state_at
+    run, cycle = worker.transfer.at
     late = State(run, cycle - 5, "planning", "R2", number=7)
     key = world.stamper.place.keys.of(channels.STATE, "planning", "E", "R2")
     worker.receive(Arrival(key, b"3", encode(late)), world.network.now_ns)
@@ -590,9 +590,9 @@ def test_rule_8_a_state_is_of_who_was_asked_and_of_no_cycle_beyond_the_newest(
     world.run(1_000)
     world.pin("SO")
     target = world.worker("planning@E")
-    while target._awaited is None:
+    while target.transfer.awaited is None:
         world.run(1)
-    false_state(world, "E", source, ahead, target._awaited.number)
+    false_state(world, "E", source, ahead, target.transfer.awaited.number)
     world.run(3_000)
     assert world.stamper.placement == "SO"
     require_whole(world)

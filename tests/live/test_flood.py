@@ -13,9 +13,9 @@ import pytest
 
 import dwell
 from dwell.live.host.agent import Agent
+from dwell.live.roles.joins import MAX_JOINS
 from dwell.live.roles.loads import MOST_PROCESSES, ProcessLoads
 from dwell.live.roles.role import MAX_COMPLAINTS
-from dwell.live.roles.worker import MAX_JOINS
 from dwell.live.wire import channels
 from dwell.live.wire.messages import MAX_CONTROL_BYTES, Carried, Stamped, decode, encode
 from dwell.live.wire.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBatch

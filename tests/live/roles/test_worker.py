@@ -210,7 +210,7 @@ def test_a_worker_s_beats_go_on_while_its_stage_writes_its_state(problem: Proble
     wire, stage = Wire(), Slow()
     place = RolePlace(cell, "planning@R2", "R2", wire)
     worker = Worker(place, "planning", stage)
-    worker.state_at = 1, 5
+    worker.transfer.at = 1, 5
     asked = Snapshot(7, "planning", "R2", "E", 1, 6)
     worker.receive(Arrival(place.keys.of(channels.SNAPSHOT, "planning", "R2"), encode(asked)), 0)
     stopped = threading.Event()

@@ -12,8 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
+from dwell.live.roles.joins import MAX_JOINS
 from dwell.live.roles.role import MAX_COMPLAINTS, MAX_STRANGERS, Pulse
-from dwell.live.roles.worker import MAX_JOINS, Worker
+from dwell.live.roles.worker import Worker
 from dwell.live.stage import Message
 from dwell.live.wire import channels
 from dwell.live.wire.messages import (
