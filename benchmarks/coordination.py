@@ -35,6 +35,7 @@ from dwell.sim import fleet as fleets
 from dwell.sim.fleet import phased, simulate_fleet, tabled_cells
 from dwell.study.fleet_plan import best_placements, plan_fleet
 from dwell.study.intervals import mean_interval
+from reproduction.evidence.measured_on import measured_on
 
 ESTIMATORS = "corrected", "scaling", "shadow"
 RULES = "ledger", "random", "most-gain-first", "none"
@@ -328,6 +329,7 @@ def main(arguments: Iterable[str] | None = None) -> None:
     parser.add_argument("--processes", type=int, default=2)
     asked = parser.parse_args(arguments if arguments is None else list(arguments))
     seeds = range(1, asked.seeds + 1)
+    print(measured_on(), end="\n\n", flush=True)
     with ProcessPoolExecutor(asked.processes) as pool:
         for text in (asked.what or rules)(asked.cells, seeds, pool):
             print(text, end="", flush=True)

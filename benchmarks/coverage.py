@@ -24,6 +24,7 @@ from dwell.study.intervals import (
     share_interval,
     share_limits,
 )
+from reproduction.evidence.measured_on import measured_on
 
 if TYPE_CHECKING:
     import polars as pl
@@ -129,6 +130,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=STUDIES * max(SIZES))
     parser.add_argument("--processes", type=int, default=None)
     asked = parser.parse_args()
+    print(measured_on(), end="\n\n", flush=True)
     print("\n".join(of_populations()), end="\n\n", flush=True)
     played = compare(
         dwell.load("examples/canonical.yaml"),

@@ -23,6 +23,7 @@ from dwell.report.figure import Figure, Spec, printed_svg
 from dwell.report.figure_files import BOTH_PT
 from dwell.report.palette import Palette
 from dwell.study import mean_interval
+from reproduction.evidence.measured_on import measured_on
 
 IMAGES = Path(__file__).parent / "images"
 DATA, DRAWING = IMAGES / "decide-cycles.csv", IMAGES / "decide-cycles.svg"
@@ -127,6 +128,7 @@ def main() -> None:
         "undone": ("Moves undone in 100 windows", 1),
         "over_oracle": ("J above the oracle's, %", 1),
     }
+    print(measured_on())
     for measure, (heading, decimals) in headings.items():
         print(f"\n{heading}\n")
         print("\n".join(table(runs, measure, decimals)))

@@ -1,4 +1,4 @@
-"""Write reproduction/evidence/dynamic-scenarios.md: `python docs/dynamic_tables.py`, half a minute.
+"""Write reproduction/evidence/dynamic-scenarios.md: `python -m docs.dynamic_tables`, half a minute.
 
 Static placements over 20 seeds: J and V_D of the windows inside one phase, with the 95 % interval
 of J over seeds. The lowest J is bold if it differs from the next, seed by seed.
@@ -6,10 +6,7 @@ of J over seeds. The lowest J is bold if it differs from the next, seed by seed.
 
 from __future__ import annotations
 
-import platform
-import subprocess
 from collections.abc import Iterator, Mapping
-from datetime import date
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -20,6 +17,7 @@ import dwell
 from dwell.model import NodeDisturbance, Problem
 from dwell.study import load_study, mean_interval
 from dwell.study.drawn_disturbances import drawn_disturbances
+from reproduction.evidence.measured_on import measured_on
 
 ROOT = Path(__file__).parents[1]
 STUDY = ROOT / "examples" / "studies" / "dynamic.yaml"
@@ -111,8 +109,8 @@ def faults(
 
 HEAD = """# Static placements in the dynamic scenarios
 
-`python docs/dynamic_tables.py` wrote this page on {day} ({machine}, commit
-{commit}). J and V_D of each placement if it never moves, 20 seeds of 300 windows, the warm-up left
+{measured} `python -m docs.dynamic_tables` wrote
+this page: J and V_D of each placement if it never moves, 20 seeds of 300 windows, the warm-up left
 out; ± is the 95 % interval over seeds. The lowest J is bold if its interval to the next, seed by
 seed, leaves out 0. [Dynamic scenarios](../../docs/background/dynamic-scenarios.md) describes the
 phases and faults.
@@ -174,11 +172,7 @@ def tables() -> Iterator[str]:
 
 def main() -> None:
     """Write the page."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
-        cwd=ROOT, capture_output=True, text=True, check=True,
-    ).stdout.strip()  # fmt: skip
-    head = HEAD.format(day=date.today().isoformat(), machine=platform.machine(), commit=commit)
+    head = HEAD.format(measured=measured_on())
     PAGE.write_text(head + "\n".join(tables()) + "\n", encoding="utf-8")
 
 

@@ -1,4 +1,4 @@
-"""The tables of reproduction/evidence/guard.md: `python docs/guard_tables.py`, some minutes.
+"""The tables of reproduction/evidence/guard.md: `python -m docs.guard_tables`, some minutes.
 
 The canonical cell under three policies, four seeds of 300 windows each, with and without its guard.
 """
@@ -16,6 +16,7 @@ import polars as pl
 import dwell
 from dwell.model import LinkDisturbance, NodeDisturbance, Problem
 from dwell.model.scenario import Disturbance
+from reproduction.evidence.measured_on import measured_on
 
 CELL = Path(__file__).parents[1] / "examples" / "canonical.yaml"
 POLICIES = "dtp", "latency-first", "work-function"
@@ -106,6 +107,7 @@ def scenario_row(problem: Problem, name: str) -> str:
 
 
 if __name__ == "__main__":
+    print(measured_on(), flush=True)
     cell = with_faults(dwell.load(CELL))
     for fault in FAULTS:
         print(fault_row(cell, fault), flush=True)

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import polars as pl
 
+from dwell.model import AIM
 from dwell.study import (
-    AIM,
     UNTOLD,
     Family,
     Interval,

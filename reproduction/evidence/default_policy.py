@@ -5,15 +5,13 @@
 
 from __future__ import annotations
 
-import platform
-import subprocess
-from datetime import date
 from pathlib import Path
 
 import numpy as np
 
 import dwell
 from dwell.study import Comparison, Interval, compare
+from reproduction.evidence.measured_on import measured_on
 
 ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).with_name("default-policy.md")
@@ -31,8 +29,8 @@ SEEDS, WINDOWS = range(2001, 2041), 60
 
 TEXT = """# The default policy against the best static placement
 
-`python -m reproduction.evidence.default_policy` wrote this page on {day} ({machine}, commit
-{commit}). {seeds} seeds of {windows} windows, of which 5 are warm-up; examples/first.yaml.
+{measured} `python -m reproduction.evidence.default_policy` wrote this page: {seeds} seeds of
+{windows} windows, of which 5 are warm-up; examples/first.yaml.
 
 The margin of {margin:g} points was written down before any of these seeds was simulated. The
 default policy (`dtp` with `corrected` estimates, four decisions per window) is within it if, in
@@ -55,17 +53,8 @@ def main() -> None:
         windows=WINDOWS,
         processes=1,
     )
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
-        cwd=ROOT,
-        check=True,
-        capture_output=True,
-        text=True,
-    ).stdout.strip()
     page = TEXT.format(
-        day=date.today().isoformat(),
-        machine=platform.machine(),
-        commit=commit,
+        measured=measured_on(),
         seeds=len(SEEDS),
         windows=WINDOWS,
         margin=100 * MARGIN,

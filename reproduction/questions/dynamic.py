@@ -13,10 +13,9 @@ from itertools import product
 import numpy as np
 import polars as pl
 
-from dwell.model import Problem
+from dwell.model import AIM, Problem
 from dwell.policies import Cusum
 from dwell.study import (
-    AIM,
     Contender,
     Hindsight,
     Interval,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from urllib.parse import urlsplit
@@ -10,7 +11,7 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, Page, sync_playwright
 
-from tests.dash.served import until
+from tests.waiting import wait_until
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 #: True once a cell's page is drawn.
@@ -29,7 +30,7 @@ def chromium() -> Iterator[Browser]:
 
 def wait_for(page: Page, expression: str) -> None:
     """Wait until an expression is true; Playwright's own way needs `unsafe-eval`."""
-    until(lambda: page.evaluate(f"Boolean({expression})"))
+    wait_until(lambda: page.evaluate(f"Boolean({expression})"))
 
 
 #: Counts the requests of a page that have no answer yet.
@@ -57,6 +58,24 @@ SETTLED = """async () => {
 def settled(shown: Page) -> None:
     """Wait until what was asked for is drawn."""
     shown.evaluate(SETTLED)
+
+
+def played(shown: Page, for_ms: int = 300) -> float:
+    """Play at speed 5 for a time of the page's clock, and pause; return the place.
+
+    The clock only runs here, so that the page does not reach its end before the click on Pause.
+    """
+    shown.clock.install()
+    shown.clock.pause_at(time.time() + 60)
+    shown.get_by_role("combobox").select_option("5")
+    begin = shown.evaluate("window.page.at")
+    shown.get_by_role("button", name="Play", exact=True).click()
+    shown.clock.run_for(for_ms)
+    shown.get_by_role("button", name="Pause").click()
+    place: float = shown.evaluate("window.page.at")
+    assert begin < place <= begin + 5e-3 * for_ms
+    shown.clock.resume()
+    return place
 
 
 @contextmanager

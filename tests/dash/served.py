@@ -7,7 +7,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from http.client import HTTPConnection
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
 from tests.cli.small_cell import environment
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 ROOT = Path(__file__).parents[2]
 
@@ -146,14 +145,6 @@ def started(folder: Path, words: Sequence[str]) -> Iterator[Served]:
     assert process.returncode == 0
 
 
-def until(holds: Callable[[], object]) -> None:
-    """Wait until something holds."""
-    limit_s = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < limit_s, "it has not come about"
-        time.sleep(0.05)
-
-
 def state(page: Served) -> Mapping[str, Any]:
     """Return what the page says of its cell."""
     found: Mapping[str, Any] = page.get("/state?at=0")
@@ -162,4 +153,4 @@ def state(page: Served) -> Mapping[str, Any]:
 
 def until_state(page: Served, holds: Callable[[Mapping[str, Any]], object]) -> None:
     """Wait until something holds of the cell."""
-    until(lambda: holds(state(page)))
+    wait_until(lambda: holds(state(page)))

@@ -15,7 +15,7 @@ from dwell.record import FleetRun, open_fleet
 from dwell.record.fleet_run import LOAD, UNFINISHED
 from dwell.record.run import FLEET
 from tests.dash.browser import READY as CELL_READY
-from tests.dash.browser import in_browser, opened, settled, wait_for
+from tests.dash.browser import in_browser, opened, played, settled, wait_for
 from tests.dash.served import Served, serving
 from tests.dash.test_serving import LIVE, ran
 
@@ -199,11 +199,7 @@ def test_a_click_opens_a_cell_at_the_same_place_and_leads_back(shown: Page, runs
 
 @in_browser
 def test_a_fleet_plays_steps_and_zooms(shown: Page) -> None:
-    shown.get_by_role("combobox").select_option("5")
-    shown.get_by_role("button", name="Play", exact=True).click()
-    wait_for(shown, "window.page.at > 1")
-    shown.get_by_role("button", name="Pause").click()
-    at = shown.evaluate("window.page.at")
+    at = played(shown)
     shown.get_by_role("button", name="One window on").click()
     assert shown.evaluate("window.page.at") == pytest.approx(at + 0.2)
     shown.keyboard.press("+")

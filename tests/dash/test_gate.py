@@ -10,8 +10,8 @@ from collections.abc import Mapping
 import pytest
 
 from dwell.dash.gate import HEADERS
-from tests.dash.served import Served, until
-from tests.waiting import PATIENCE_S
+from tests.dash.served import Served
+from tests.waiting import PATIENCE_S, wait_until
 
 DATA = "/cells", "/view?begin=0&end=1", "/state?at=0", "/jobs?begin=0&end=1", "/events"
 
@@ -179,7 +179,7 @@ def test_readers_beyond_the_most_are_refused_and_others_go_on(page: Served) -> N
     finally:
         for one in crowd:
             one.close()
-    until(lambda: _is_read(page))
+    wait_until(lambda: _is_read(page))
 
 
 def _is_read(page: Served) -> bool:

@@ -14,8 +14,9 @@ from dwell.dash.observer import Observer
 from dwell.dash.watched_cell import WatchedCell
 from tests.cli.live_cell import MOODY, RealCell
 from tests.dash.browser import chromium, in_browser, opened, wait_for
-from tests.dash.served import Served, serving, state, until, until_state
+from tests.dash.served import Served, serving, state, until_state
 from tests.record.test_mcap_file import metadata, read
+from tests.waiting import wait_until
 
 MARKUP = "<script>window.pwned=1</script><img src=x onerror=window.pwned=1>"
 
@@ -73,14 +74,16 @@ def test_a_cell_that_nobody_controls_is_absent(absent: RealCell, early: Served) 
 
 def test_an_observer_hears_every_cycle_once_and_every_job(cell: RealCell) -> None:
     with Observer(cell.problem) as observer:
-        until(
+        wait_until(
             lambda: (
                 sum(one.latency_ns is not None for one in observer.cycles.since(0).items) >= 50
                 and observer.windows.upto >= 2
             )
         )
         cycles = observer.cycles.since(0).items
-        until(lambda: observer.now().status.get("placement") == observer.now().placement == "LOC")
+        wait_until(
+            lambda: observer.now().status.get("placement") == observer.now().placement == "LOC"
+        )
         now = observer.now()
     numbers = [cycle.number for cycle in cycles]
     assert len(numbers) == len(set(numbers))
@@ -99,7 +102,7 @@ def test_an_observer_hears_every_cycle_once_and_every_job(cell: RealCell) -> Non
 def test_an_observer_says_nothing_but_questions(cell: RealCell) -> None:
     """It has no place among who is heard, and nobody is asked to hear it."""
     with Observer(cell.problem) as observer:
-        until(lambda: observer.cycles.upto >= 20)
+        wait_until(lambda: observer.cycles.upto >= 20)
         status = cell.until(lambda status: status["window"])
     assert not [who for who in status["processes"] if "visitor" in who]
     assert status["strangers"] == {}
@@ -108,7 +111,7 @@ def test_an_observer_says_nothing_but_questions(cell: RealCell) -> None:
 def test_what_is_watched_is_ready_for_json(cell: RealCell) -> None:
     with Observer(cell.problem) as observer:
         watched = WatchedCell(observer)
-        until(lambda: observer.cycles.upto >= 60 and observer.windows.upto >= 2)
+        wait_until(lambda: observer.cycles.upto >= 60 and observer.windows.upto >= 2)
         whole = watched.described()
         view = watched.view(whole["begin"], whole["end"], 100)
         found = [whole, view, watched.state(0.0), watched.jobs(whole["begin"], whole["end"])]
@@ -147,7 +150,7 @@ def test_a_reader_who_does_not_read_holds_nobody_up(acting: Served) -> None:
 
 
 def test_it_is_ready_while_the_cell_is_well(acting: Served) -> None:
-    until(lambda: acting.ask("/readyz").status == 200)
+    wait_until(lambda: acting.ask("/readyz").status == 200)
     assert acting.ask("/readyz").body == b"ready\n"
 
 
@@ -198,11 +201,11 @@ def test_an_act_that_cannot_be_is_refused_with_why(
 def test_acts_are_done_and_said(acting: Served) -> None:
     until_state(acting, lambda found: found["placement"] == "LOC")
     assert acting.act("pin", {"candidate": "HYB"}).value["pinned"] == "HYB"
-    until(lambda: "LOC → HYB: pinned" in events(acting))
+    wait_until(lambda: "LOC → HYB: pinned" in events(acting))
     assert acting.act("drain", {"node": "E"}).status == 409
     assert acting.act("unpin", {}).value["pinned"] is None
     assert acting.act("drain", {"node": "E"}).value["drained"] == ["E"]
-    until(lambda: "HYB → LOC: E drained" in events(acting))
+    wait_until(lambda: "HYB → LOC: E drained" in events(acting))
     assert acting.act("undrain", {"node": "E"}).value["drained"] == []
     assert {"pinned to HYB", "unpinned", "E drained", "E no longer drained"} <= events(acting)
     said = acting.said
@@ -240,7 +243,7 @@ def test_a_stage_that_raises_markup_is_only_text(cell: RealCell, acting: Served)
                 and any(MARKUP in one.get("note", "") for one in found["processes"])
             ),
         )
-        until(lambda: acting.ask("/readyz").status == 503)
+        wait_until(lambda: acting.ask("/readyz").status == 503)
         with chromium() as browser, opened(browser, acting.address) as shown:
             wait_for(shown, "document.querySelector('.heard').textContent.includes('<script>')")
             wait_for(shown, "document.querySelector('.health').textContent.includes('<script>')")
@@ -248,7 +251,7 @@ def test_a_stage_that_raises_markup_is_only_text(cell: RealCell, acting: Served)
             assert shown.locator("main img, main script").count() == 0
     finally:
         cell.mood.unlink()
-    until(lambda: acting.ask("/readyz").status == 200)
+    wait_until(lambda: acting.ask("/readyz").status == 200)
 
 
 def test_without_control_it_only_looks(cell: RealCell) -> None:
@@ -269,10 +272,12 @@ def test_a_live_cell_is_recorded_and_its_numbers_are_read(cell: RealCell, tmp_pa
         def numbers() -> str:
             return page.ask("/metrics", page.bearer).body.decode()
 
-        until(lambda: re.search(r'cycles_total\{.*outcome="actuated"\} \d\d\.0', numbers()))
-        until(lambda: 'placement="LOC"' in numbers() and "dwell_utilisation_ratio{" in numbers())
+        wait_until(lambda: re.search(r'cycles_total\{.*outcome="actuated"\} \d\d\.0', numbers()))
+        wait_until(
+            lambda: 'placement="LOC"' in numbers() and "dwell_utilisation_ratio{" in numbers()
+        )
         # The first may be what the controller says of the last before the page came.
-        until(lambda: len(page.get("/view?begin=0&end=1e6")["windows"]["at"]) > 1)
+        wait_until(lambda: len(page.get("/view?begin=0&end=1e6")["windows"]["at"]) > 1)
         # Whoever watches may stand still: the cell goes on.
         page.process.send_signal(signal.SIGSTOP)
         try:

@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests.cli.live_cell import RealCell, invoke
-from tests.dash.served import serving, until, until_state
+from tests.dash.served import serving, until_state
 from tests.live.commands.test_live_secure import SecureCell
+from tests.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def test_an_observer_sees_and_may_not_act(secure: SecureCell) -> None:
     assert "observer" in stderr
     with serving(secure.folder, secure.file, "--keys", keys) as page:
         until_state(page, lambda found: found["health"] == "ok")
-        until(lambda: page.get("/view?begin=0&end=1e6")["cycles"] > 20)
+        wait_until(lambda: page.get("/view?begin=0&end=1e6")["cycles"] > 20)
         assert page.act("pin", {"candidate": "SO"}).status == 403
 
 

@@ -12,7 +12,7 @@ import pytest
 from playwright.sync_api import Browser, Page, expect
 
 import dwell
-from tests.dash.browser import in_browser, opened, settled, wait_for
+from tests.dash.browser import in_browser, opened, played, settled, wait_for
 from tests.dash.recorded import small_run
 from tests.dash.served import Served, serving
 
@@ -109,11 +109,7 @@ def test_stages_stand_where_they_run(shown: Page, run: dwell.Run) -> None:
 
 
 def test_it_plays_steps_and_stops(shown: Page) -> None:
-    shown.get_by_role("combobox").select_option("5")
-    shown.get_by_role("button", name="Play").click()
-    wait_for(shown, "window.page.at > 1")
-    shown.get_by_role("button", name="Pause").click()
-    at = shown.evaluate("window.page.at")
+    at = played(shown)
     shown.get_by_role("button", name="One window on").click()
     assert shown.evaluate("window.page.at") == pytest.approx(at + 0.2)
     shown.get_by_role("button", name="One window back").click()

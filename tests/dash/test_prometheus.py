@@ -19,9 +19,9 @@ import pytest
 import yaml
 
 from dwell.dash.metrics import CellMetrics
-from tests.dash.served import ROOT, Served, started, until
+from tests.dash.served import ROOT, Served, started
 from tests.dash.stand_in import StandIn
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 EXAMPLES = ROOT / "examples/monitoring"
 TOKEN = "a-token-of-the-tests-that-nobody-guesses"
@@ -128,7 +128,7 @@ class Prometheus:
             found[:] = [one for one in targets if one["health"] != "unknown"]
             return bool(found)
 
-        until(scraped)
+        wait_until(scraped)
         return found[0]
 
     def result(self, query: str) -> list[dict[str, Any]]:
@@ -139,7 +139,7 @@ class Prometheus:
             found[:] = (self.get("query", query=query) or {}).get("result") or []
             return bool(found)
 
-        until(known)
+        wait_until(known)
         return found
 
 

@@ -13,6 +13,7 @@ import pytest
 from dwell.dash.recorded_fleet import RecordedFleet
 from dwell.errors import RunError
 from dwell.record import FleetRun, open_fleet
+from dwell.record.run import FLEET
 from tests.dash.recorded import small_fleet
 
 
@@ -33,6 +34,19 @@ def test_cells_stand_worst_first(fleet: RecordedFleet, runs: FleetRun) -> None:
     assert {cell["name"]: cell["rate"] for cell in cells} == pytest.approx(rates, abs=1e-9)
     assert [cell["rate"] for cell in cells] == sorted(rates.values(), reverse=True)
     assert [[*runs.cells][cell["place"]] for cell in cells] == [cell["name"] for cell in cells]
+
+
+def test_the_aim_of_served_cells_is_their_limit(
+    fleet: RecordedFleet, fleet_folder: Path, tmp_path: Path
+) -> None:
+    folder = shutil.copytree(fleet_folder, tmp_path / "pack")
+    written = json.loads((folder / FLEET).read_text())
+    written["fleet"] |= {"objective": "served", "limit": 0.99}
+    (folder / FLEET).write_text(json.dumps(written))
+    found = RecordedFleet(folder).described()
+    assert (fleet.described()["aim"], found["aim"]) == (0.05, 0.99)
+    assert "open" in fleet.described()["verdicts"]
+    assert set(found["verdicts"]) == {"kept"}
 
 
 def test_strips_have_the_windows_of_every_cell(fleet: RecordedFleet, runs: FleetRun) -> None:

@@ -29,7 +29,6 @@ JOB = {
     "shadow": False,
     "cpu_ns": None,
     "others_ns": None,
-    "outside_ns": None,
     "handover_ns": None,
     "ending_ns": None,
 }

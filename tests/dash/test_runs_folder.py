@@ -15,7 +15,8 @@ from dwell.dash.runs_folder import MOST_RUNS, RunsFolder
 from dwell.errors import RunError
 from tests.dash.browser import in_browser, opened, settled, wait_for
 from tests.dash.recorded import WrittenRun, small_run
-from tests.dash.served import Served, serving, until
+from tests.dash.served import Served, serving
+from tests.waiting import wait_until
 
 LONG = "a-name-of-forty-characters-for-this-run-計算機計算機"
 DRAWN = "document.querySelector('.runs .source')?.textContent.includes('broken')"
@@ -40,7 +41,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory, fleet_folder: Path) -> Path:
 
 def rows_of(folder: RunsFolder) -> dict[str, dict[str, object]]:
     folder.start()
-    until(lambda: folder.rows(0)["upto"] >= folder.count)
+    wait_until(lambda: folder.rows(0)["upto"] >= folder.count)
     names = folder.described()["runs"]
     return {names[row["place"]]: row for row in folder.rows(0)["rows"]}
 
@@ -78,10 +79,10 @@ def test_a_running_run_is_named_and_read_again(tmp_path: Path) -> None:
     row = rows_of(folder)["running"]
     assert (row["state"], row["windows"], row["verdict"]) == ("running", 15, None)
     written.go_on(10)
-    until(lambda: folder.rows(folder.count)["rows"])
+    wait_until(lambda: folder.rows(folder.count)["rows"])
     assert folder.rows(folder.count)["rows"][0]["windows"] == 25
     written.close()
-    until(lambda: folder.rows(0)["rows"][-1]["state"] == "unfinished")
+    wait_until(lambda: folder.rows(0)["rows"][-1]["state"] == "unfinished")
 
 
 def test_ten_thousand_runs_are_listed_at_once(tmp_path: Path) -> None:

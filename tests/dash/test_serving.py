@@ -19,8 +19,8 @@ from dwell.record import seal_run
 from dwell.record.journal import JOURNAL
 from tests.cli.small_cell import CANONICAL, environment
 from tests.dash.recorded import WrittenRun
-from tests.dash.served import dash, serving, until
-from tests.waiting import PATIENCE_S
+from tests.dash.served import dash, serving
+from tests.waiting import PATIENCE_S, wait_until
 
 LIVE = ("msgspec", "zenoh", "cryptography", "psutil")
 TABLES = ("polars", "scipy")
@@ -135,7 +135,7 @@ def test_the_browser_is_given_a_file_that_others_cannot_read(
         assert process.stdout is not None
         address = process.stdout.readline().strip()
         token = address.partition("token=")[2]
-        until((tmp_path / "done").exists)
+        wait_until((tmp_path / "done").exists)
         words = (tmp_path / "words").read_text()
         assert token
         assert token not in words
@@ -210,7 +210,7 @@ def test_a_run_that_is_written_is_shown_as_far_as_it_has_come(
             heard = b""
             while b"data: " not in heard:
                 heard += reader.recv(65_536)
-        until(lambda: page.get("/cells")["cells"][0]["cycles"] == 400)
+        wait_until(lambda: page.get("/cells")["cells"][0]["cycles"] == 400)
         # Half a frame at its end is not read.
         with (tmp_path / "run" / JOURNAL).open("ab") as journal:
             journal.write(b"\x00\x01")

@@ -62,7 +62,7 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
 
     def counted() -> Counts:
         at_ns = group()
-        return Counts(at_ns, 2 * at_ns, at_ns)
+        return Counts(at_ns, at_ns)
 
     for role in world.roles.values():
         worker = getattr(role, "worker", None)
@@ -75,7 +75,7 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
     world.run(4_000)
     jobs = frames(problem, world.recorder.rows)
     simulated = dwell.simulate(problem, policy="LOC", seed=1, windows=2, jobs=True).jobs
-    spent = ["cpu_ns", "others_ns", "outside_ns", "handover_ns", "ending_ns"]
+    spent = ["cpu_ns", "others_ns", "handover_ns", "ending_ns"]
     assert jobs.columns == [*simulated.columns, "shadow", *spent]
 
     nodes = {"sensing": "R1", "perception": "R1", "planning": "R2", "control": "R2"}
@@ -92,9 +92,9 @@ def test_jobs_are_those_of_the_simulator(problem: Problem) -> None:
     assert not settled["shadow"].any()
     assert settled["cpu_ns"].unique().to_list() == [CPU_NS]
     # Only where something counts them.
-    assert settled.select("node", "others_ns", "outside_ns").unique().sort("node").rows() == [
-        ("R1", None, None),
-        ("R2", OTHERS_NS, 2 * OTHERS_NS),
+    assert settled.select("node", "others_ns").unique().sort("node").rows() == [
+        ("R1", None),
+        ("R2", OTHERS_NS),
     ]
     # From the end of a job to the start of the next on the same node; the stamper's has no count.
     handed = settled.select("task", "handover_ns").unique(maintain_order=True).rows()

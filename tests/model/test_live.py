@@ -32,3 +32,9 @@ def test_a_class_is_named_by_module_and_name(name: str) -> None:
         require_callable_name("run", name)
     with pytest.raises(ProblemError, match=r"live\.actuators\.control"):
         LiveSettings(actuators={"control": name})
+
+
+def test_a_cell_above_the_aim_is_degraded() -> None:
+    assert LiveSettings().degraded_by([0.06, 0.06, 0.06])
+    assert not LiveSettings().degraded_by([0.05, 0.05, 0.05])
+    assert not LiveSettings(degraded_at=0.1).degraded_by([0.06, 0.06, 0.06])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from copy import copy
 from dataclasses import replace
 
 import polars as pl
@@ -55,6 +57,19 @@ def test_cells_stand_with_the_worst_first(run: FleetRun) -> None:
     drawn = figure_of(page, "cells").frames["rows"]
     assert drawn.filter(measure="L95 (ms)")["limit"].to_list() == [5.0] * 4
     assert drawn.filter(measure="V_D (%)")["limit"].to_list() == [5.0] * 4
+
+
+def test_the_aim_of_served_cells_is_their_limit() -> None:
+    run = dwell.simulate_fleet(ledger_of(2), seed=1, windows=30, policy="dtp", phases="even")
+    served = copy(run)
+    served.fleet = replace(run.fleet, objective="served", limit=0.9)
+    page = fleet_page(served)
+    assert {row["verdict"] for row in table_of(page, "cell-table").rows} == {"kept"}
+    assert facts_of(page)["cells that keep the aim"].error == "of 2; under 90 %"
+    drawn = figure_of(page, "cells").frames["rows"]
+    assert drawn.filter(measure="V_D (%)")["limit"].to_list() == [90.0] * 2
+    for one, limit in ((served, "90 %"), (run, "5 %")):
+        assert f'"{limit}"' in json.dumps(figure_of(fleet_page(one), "time").draw(800.0))
 
 
 def test_a_cell_has_the_numbers_of_other_pages(run: FleetRun) -> None:

@@ -7,8 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from lab.tests.testbed.machine import no_groups, no_hosts, own_name
 from tests.cells.light import QUOTAS, document, write_cell
 from tests.cli.small_cell import assert_refused, call
 from tests.processes import lives
+from tests.waiting import wait_until
 
 PATIENCE_S = 240.0
 NOT_ROOT = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")
@@ -53,13 +53,6 @@ def left(name: str) -> list[str]:
     return found
 
 
-def wait_for(event: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not event():
-        assert time.monotonic() < until, f"waited in vain for {what}"
-        time.sleep(0.1)
-
-
 @contextmanager
 def running(cell: Path, out: Path, name: str) -> Iterator[subprocess.Popen[bytes]]:
     """Start a long run, and wait until its stamper is there."""
@@ -70,7 +63,11 @@ def running(cell: Path, out: Path, name: str) -> Iterator[subprocess.Popen[bytes
         )
     try:
         stamper = out / "R1" / "stamper@R1.pid"
-        wait_for(lambda: stamper.exists() or process.poll() is not None, "the stamper")
+        wait_until(
+            lambda: stamper.exists() or process.poll() is not None,
+            "the stamper",
+            patience_s=PATIENCE_S,
+        )
         assert process.poll() is None, errors.read_text()
         yield process
     finally:

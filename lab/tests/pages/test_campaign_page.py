@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from dwell.report.page import page_html
 from dwell.study import UNTOLD
-from dwell_lab.pages.campaign_page import campaign_html, campaign_page, campaign_text
+from dwell_lab.pages.campaign_page import campaign_page, campaign_text
 from dwell_lab.testbed.campaign import Campaign, default_entrants, default_scenarios, entrant
 from dwell_lab.testbed.execution import run_campaign
 from dwell_lab.validation.measured_campaign import MeasuredCampaign, read_measured
@@ -38,7 +39,7 @@ def measured(folder: Path) -> MeasuredCampaign:
 
 
 def test_the_page_is_whole_and_loads_nothing(measured: MeasuredCampaign) -> None:
-    page = Page(campaign_html(measured, static=True))
+    page = Page(page_html(campaign_page(measured), static=True))
     assert page.outside == []
     assert "script" not in page.tags
     assert len(page.ids) == len(set(page.ids))
@@ -76,6 +77,6 @@ def test_the_text_has_everything_and_the_answers_last(measured: MeasuredCampaign
 
 def test_a_campaign_of_one_policy_has_a_page(tmp_path: Path) -> None:
     found = read_measured(made(tmp_path / "there", ("LOC",), 1))
-    page = Page(campaign_html(found, static=True))
+    page = Page(page_html(campaign_page(found), static=True))
     assert "RQ1" not in page.text
     assert page.outside == []

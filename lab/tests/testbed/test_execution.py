@@ -11,7 +11,8 @@ import pytest
 import dwell
 from dwell.errors import LiveError
 from dwell.record import open_run
-from dwell_lab.pages.campaign_page import campaign_html
+from dwell.report.page import page_html
+from dwell_lab.pages.campaign_page import campaign_page
 from dwell_lab.testbed.campaign import Campaign, entrant
 from dwell_lab.testbed.campaign_folder import read_campaign
 from dwell_lab.testbed.execution import run_campaign
@@ -70,4 +71,4 @@ def test_a_campaign_is_measured_and_reported(tmp_path: Path) -> None:
         pytest.skip("the machine was the bottleneck in every run")
     measured = read_measured(folder)
     assert measured.kinds == {"live"}
-    assert "Delays of messages" in campaign_html(measured, static=True)
+    assert "Delays of messages" in page_html(campaign_page(measured), static=True)

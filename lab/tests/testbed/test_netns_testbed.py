@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,9 +19,7 @@ from dwell_lab.testbed.hosts import namespace_name, namespace_path
 from dwell_lab.testbed.netns_testbed import NetnsTestbed
 from lab.tests.testbed.machine import no_groups, no_hosts, own_name
 from tests.cells.light import document, write_cell
-
-#: Far more than any of it takes, on a machine that has a lot else to do.
-PATIENCE_S = 120.0
+from tests.waiting import wait_until
 
 
 @pytest.fixture(scope="module")
@@ -33,13 +31,6 @@ def testbed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[NetnsTestbed]:
     cell = write_cell(folder)
     with NetnsTestbed(dwell.load(cell), folder / "out", name=own_name()) as one:
         yield one
-
-
-def wait_for(event: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not event():
-        assert time.monotonic() < until, f"waited in vain for {what}"
-        time.sleep(0.1)
 
 
 def test_what_a_testbed_does_not_have_is_refused(tmp_path: Path) -> None:
@@ -74,7 +65,9 @@ def test_stress_is_in_the_group_of_its_node(testbed: NetnsTestbed) -> None:
     testbed.apply(Change(0, "R2", NodeState(2)))
     begun_ns = testbed.used_ns["R2"]()
     # Far less than its quota, far more than its stages take.
-    wait_for(lambda: testbed.used_ns["R2"]() - begun_ns > 500_000_000, "half a second of CPU time")
+    wait_until(
+        lambda: testbed.used_ns["R2"]() - begun_ns > 500_000_000, "half a second of CPU time"
+    )
     testbed.apply(Change(1, "R2", NodeState(0)))
 
 
@@ -82,10 +75,10 @@ def test_a_link_that_is_down_lets_nothing_through(testbed: NetnsTestbed) -> None
     link = testbed.links[frozenset(("R1", "R2"))]
     usual = usual_conditions(testbed.problem.fabric.links["R1->R2"])
     testbed.apply(Change(0, "R1->R2", replace(usual, down=True, loss=0.5)))
-    wait_for(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
+    wait_until(lambda: link.read()["R1", "R2"].vanished > 0, "packets that vanish")
     testbed.apply(Change(1, "R1->R2", usual))
     link.read()
-    wait_for(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
+    wait_until(lambda: link.read()["R1", "R2"].packets > 0, "packets that arrive")
 
 
 def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> None:
@@ -97,7 +90,7 @@ def test_delays_at_once_add_up_each_at_its_strength(testbed: NetnsTestbed) -> No
         testbed.apply(Change(0, "R1->R2", now))
         # What began before has the delay of before.
         link.read()
-        wait_for(lambda: link.read(reset=False)["R1", "R2"].bursts >= 5, "messages")
+        wait_until(lambda: link.read(reset=False)["R1", "R2"].bursts >= 5, "messages")
         added_ms = 4.0 * shares[0] + 9.0 * shares[1]
         assert link.read()["R1", "R2"].delay_mean_ms == pytest.approx(own_ms + added_ms, abs=1e-3)
     testbed.apply(Change(1, "R1->R2", usual))
@@ -117,7 +110,7 @@ def test_a_node_that_was_down_comes_back(testbed: NetnsTestbed) -> None:
         names = [who for who in expected(testbed.problem) if "@R2" in who]
         return all(who in heard and heard[who]["age_ms"] < 1_000 for who in names)
 
-    wait_for(ready, "the processes of R2")
+    wait_until(ready, "the processes of R2")
     assert not there & set(testbed.switches["R2"]())
 
 

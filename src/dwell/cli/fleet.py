@@ -419,7 +419,8 @@ def _cells(result: FleetRun, cells: Sequence[Mapping[str, Any]]) -> Iterator[str
     yield aligned(head, rows)
     if len(cells) > SHOWN:
         yield f"{len(cells) - SHOWN} more, with fewer misses, are in the folder"
-    yield f"where: {legend}; V_D, L95 and J leave the warm-up out; aim: V_D under 5 %"
+    aim = f"aim: V_D under {result.fleet.aim * 100:g} %"
+    yield f"where: {legend}; V_D, L95 and J leave the warm-up out; {aim}"
 
 
 def _letters(names: Iterable[str]) -> dict[str, str]:

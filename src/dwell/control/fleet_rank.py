@@ -11,7 +11,8 @@ from dwell.control.table_loads import UNSERVED, shortfall
 from dwell.cost import GAIN_TOLERANCE, exceeds
 from dwell.estimators.fleet_prices import CellPrice, FleetPrice, PricedCell
 from dwell.estimators.slow_processes import unseen_error
-from dwell.model.fleet import LIMIT, FleetObjective
+from dwell.model.fleet import FleetObjective
+from dwell.model.objective import AIM
 
 #: Distance of V_D from the limit in standard errors at which a cell becomes served or not served.
 DEVIATIONS = 2.0
@@ -182,4 +183,4 @@ def fleet_rank(
     """
     if objective == "sum":
         return FleetRank(cells)
-    return WorstFirst(cells) if objective == "worst" else MostServed(cells, limit or LIMIT)
+    return WorstFirst(cells) if objective == "worst" else MostServed(cells, limit or AIM)

@@ -36,7 +36,6 @@ from dwell.model.fleet import FleetCell
 from dwell.model.number_arrays import Floats
 from dwell.record import FleetRun, Run, open_fleet
 from dwell.record.fleet_run import how_many_are_whole, listed
-from dwell.study.kept_bounds import AIM
 from dwell.study.verdict import verdict_of
 
 #: Largest number of bins of all cells together (about 90 bytes each); smallest number per cell.
@@ -139,7 +138,8 @@ class RecordedFleet:
             if cell.name not in run.cells:
                 continue
             try:
-                yield _member(place, cell, run.cells[cell.name], run.phases_ms[cell.name])
+                phase_ms = run.phases_ms[cell.name]
+                yield _member(place, cell, run.cells[cell.name], phase_ms, run.fleet.aim)
             except RunError as error:
                 self._faults.append(str(error))
 
@@ -237,7 +237,7 @@ class RecordedFleet:
             "worst": self._members[0].windows.worst(),
             "disturbed": self._bands,
             "verdicts": dict(Counter(one.verdict for one in self._members if one.verdict)),
-            "aim": AIM,
+            "aim": run.fleet.aim,
             "cells": [
                 {
                     "place": one.place,
@@ -313,7 +313,7 @@ class RecordedFleet:
         }
 
 
-def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
+def _member(place: int, cell: FleetCell, run: Run, phase_ms: float, aim: float) -> _Member:
     pipeline = cell.problem.pipeline
 
     def opens(first: NDArray[np.int64]) -> Floats:
@@ -332,7 +332,7 @@ def _member(place: int, cell: FleetCell, run: Run, phase_ms: float) -> _Member:
     )
     counted = windows.rates[windows.counts]
     rate = float(counted.mean()) if len(counted) else np.nan
-    verdict = verdict_of(run, cell.problem, rate).word if len(counted) else None
+    verdict = verdict_of(run, cell.problem, rate, aim).word if len(counted) else None
     return _Member(place, cell.name, cell.problem, windows, rate, verdict, strip)
 
 

@@ -5,7 +5,7 @@ from dwell.model.evolve import evolve
 from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
 from dwell.model.frozen import FrozenDict
 from dwell.model.live import Endpoint, Host, LiveSettings
-from dwell.model.objective import Caps, Objective, Targets, Tier, Weights
+from dwell.model.objective import AIM, Caps, Objective, Targets, Tier, Weights
 from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -32,6 +32,7 @@ from dwell.model.scenario import (
 from dwell.model.servo import MovingTarget, Servo
 
 __all__ = [
+    "AIM",
     "AR1",
     "REASONS",
     "Bursts",

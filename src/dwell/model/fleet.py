@@ -11,6 +11,7 @@ from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import Bound, as_read, counted
 from dwell.model.declaration import declared, declared_fields, key
 from dwell.model.fabric import Node
+from dwell.model.objective import AIM
 from dwell.model.problem import Problem
 from dwell.model.scenario import Disturbance, NodeDisturbance, Scenario
 from dwell.model.semantics import episode_faults, nearest, nearest_of
@@ -24,8 +25,6 @@ PHASES = ("sync", "even", "random")
 PHASE_WAYS = f"one of {', '.join(PHASES)}, or a list of ms"
 MOST_CELLS = 1_000
 COUNT = Bound(1, MOST_CELLS, whole=True)
-#: Largest V_D of a cell that is served, if a file gives no limit.
-LIMIT = 0.05
 
 #: Count and cell of an entry; None for an unreadable cell.
 Kind: TypeAlias = "tuple[int, Problem | None]"
@@ -109,7 +108,7 @@ class Fleet:
         "Largest V_D of a cell that is served.",
         Bound(0, 1, above=True, below=True),
         default=None,
-        usual=f"{LIMIT} with `objective: served`",
+        usual=f"{AIM} with `objective: served`",
     )
     policy: str | None = key("Policy of cells that name none.", default=None, usual="the cell's")
     estimator: str | None = key(
@@ -122,7 +121,7 @@ class Fleet:
         if not isinstance(self.phases, str):
             object.__setattr__(self, "phases", tuple(self.phases))
         if self.objective == "served" and self.limit is None:
-            object.__setattr__(self, "limit", LIMIT)
+            object.__setattr__(self, "limit", AIM)
         kinds = [(entry.count, entry.cell) for entry in self.entries]
         faults = [*fleet_faults(kinds, self.shared, self.phases)]
         met = [
@@ -133,6 +132,11 @@ class Fleet:
         faults += episode_faults(met)
         if faults:
             raise ProblemError(faults)
+
+    @property
+    def aim(self) -> float:
+        """Share of missed deadlines that each cell should be under: `limit`, if it is set."""
+        return AIM if self.limit is None else self.limit
 
     def __repr__(self) -> str:
         kinds = ", ".join(f"{one.count} {one.cell.name}" for one in self.entries)

@@ -8,6 +8,7 @@ from typing import Literal
 from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
 from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
+from dwell.model.objective import AIM
 from dwell.model.ros_topics import RosActuator
 
 #: Number of closed windows whose V_D determines whether a cell is degraded.
@@ -97,7 +98,7 @@ class LiveSettings:
         "Share of the cycles of the last three windows above which the cell is degraded: missed, "
         "not applied, or released too often or too seldom.",
         Bound(0, 1),
-        default=0.1,
+        default=AIM,
     )
     actuators: Mapping[str, str | RosActuator] = key(
         "What applies the commands of a sink task: `package.module:Name`, or `{ros2: {...}}` for "

@@ -13,6 +13,8 @@ from dwell.model.frozen import FrozenDict
 
 Tier: TypeAlias = Literal["robot", "edge", "cloud"]
 TIERS: tuple[Tier, ...] = ("robot", "edge", "cloud")
+#: Aim for a cell: a share of missed deadlines under 5 % (from the paper).
+AIM = 0.05
 
 
 #: The bounds keep J finite for any metrics.

@@ -294,14 +294,6 @@ JOBS = (
         LIVE,
     ),
     Column(
-        "outside_ns",
-        "Int64",
-        "CPU time of all other programs on its node's CPUs during the job.",
-        "ns",
-        UNTOLD,
-        LIVE,
-    ),
-    Column(
         "handover_ns",
         "Int64",
         "CPU time of its node between a release, or the end of the job before on the same node, "

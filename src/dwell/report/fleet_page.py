@@ -22,7 +22,6 @@ from dwell.report.palette import INK, MUTED, Palette
 from dwell.report.table import MOST_ROWS, WITH_WARMUP, WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.timeline import FAR, fleet_timeline, rows_px
 from dwell.report.topology import topology
-from dwell.study import AIM
 from dwell.study.fleet_summary import fleet_numbers, refusals
 from dwell.study.metric import METRICS, metric_of
 
@@ -63,6 +62,7 @@ class _FleetPage:
             raise SimulationError("no window is left after the warm-up; ask for more windows")
         self.names = [str(row["cell"]) for row in self.cells]
         self.problems = run.fleet.problems
+        self.aim = f"{100 * run.fleet.aim:g} %"
         candidates = dict.fromkeys(
             name for problem in self.problems.values() for name in problem.candidates
         )
@@ -93,7 +93,7 @@ class _FleetPage:
         worst, numbers = self.cells[0], self.numbers
         kept = sum(row["verdict"] == "kept" for row in self.cells)
         yield Fact("V_D of the worst cell", RATE.text(worst["violation_rate"]), worst["cell"])
-        yield Fact("cells that keep the aim", f"{kept}", f"of {len(self.cells)}; under 5 %")
+        yield Fact("cells that keep the aim", f"{kept}", f"of {len(self.cells)}; under {self.aim}")
         yield Fact("J", COST.text(numbers["cost"]), "mean over cells")
         most = max(row["moves"] for row in self.cells)
         yield Fact("moves", write_number(numbers["moves"], 0), f"at most {most} of a cell")
@@ -125,8 +125,8 @@ class _FleetPage:
             caption=(
                 "A row is a cell, the worst first, in the colour of its placement. V_D: median and "
                 f"quartiles of the cells; circles: outliers{self._outliers()}. Dashed: the aim of "
-                "5 %. U: all load of a shared node, foreign work included. Upright lines: moves; "
-                "in colour, a guard's. Shaded: warm-up and disturbances."
+                f"{self.aim}. U: all load of a shared node, foreign work included. Upright lines: "
+                "moves; in colour, a guard's. Shaded: warm-up and disturbances."
             ),
         )
 
@@ -158,7 +158,11 @@ class _FleetPage:
 
         deadlines = {name: one.pipeline.deadline_ms for name, one in self.problems.items()}
         # Cells of several files have several deadlines.
-        limits = {RATE: dict.fromkeys(deadlines, 100 * AIM), L95: deadlines, COST: {}}
+        limits = {
+            RATE: dict.fromkeys(deadlines, 100 * self.run.fleet.aim),
+            L95: deadlines,
+            COST: {},
+        }
         rows = [
             {
                 "cell": row["cell"],
@@ -176,7 +180,8 @@ class _FleetPage:
             "",
             {"rows": pl.DataFrame(rows, infer_schema_length=None)},
             lambda width: _dots(self.names, [one.heading for one in limits], width),
-            "Means over the windows after the warm-up. Dashed: the aim of 5 %, and the deadline.",
+            f"Means over the windows after the warm-up. Dashed: the aim of {self.aim}, and the "
+            "deadline.",
         )
 
     def _topologies(self) -> Iterator[Figure]:

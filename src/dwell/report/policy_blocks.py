@@ -11,6 +11,7 @@ import numpy as np
 
 from dwell.display import Measure
 from dwell.model.bounds import counted
+from dwell.model.objective import AIM
 from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.policies.registry import estimator_of
 from dwell.report.charts import (
@@ -29,7 +30,7 @@ from dwell.report.page import Block, Definitions
 from dwell.report.palette import Palette
 from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.topology import topology
-from dwell.study import AIM, over_seeds, under, windows_behind
+from dwell.study import over_seeds, under, windows_behind
 from dwell.study.metric import METRICS, metric_of
 
 if TYPE_CHECKING:

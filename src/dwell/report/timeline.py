@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from dwell.model.objective import AIM
 from dwell.record import shown_reason
 from dwell.record.moves import GUARD
 from dwell.report.charts import (
@@ -23,7 +24,6 @@ from dwell.report.charts import (
 )
 from dwell.report.figure import Draw, Figure, Spec
 from dwell.report.palette import BAD, INK, MUTED, SHADE, Palette
-from dwell.study import AIM
 from dwell.study.metric import METRICS
 
 if TYPE_CHECKING:
@@ -221,9 +221,10 @@ def fleet_timeline(
     windows = run.cells[first].windows
     begin_s = begins_by_number(windows, problems[first].pipeline.period_ms)
     frames["spans"] = _spans(windows, disturbed, begin_s, step_s, end_s)
+    aim = 100 * run.fleet.aim
     panels: list[tuple[float, list[Spec]]] = [
         (rows_px(len(cells)), [_placed(cells, colours)]),
-        (PANEL_PX, [*limit_rule("y", 100 * AIM, "5 %"), *_rates()]),
+        (PANEL_PX, [*limit_rule("y", aim, f"{aim:g} %"), *_rates()]),
     ]
     if resources:
         panels.append((USE_PX, _use(resources, each)))

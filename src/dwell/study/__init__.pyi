@@ -17,7 +17,6 @@ from .intervals import mean_interval as mean_interval
 from .intervals import median_interval as median_interval
 from .intervals import share_interval as share_interval
 from .intervals import under as under
-from .kept_bounds import AIM as AIM
 from .kept_bounds import keeps as keeps
 from .longest_run import longest_run as longest_run
 from .over_seeds import over_seeds as over_seeds

@@ -135,7 +135,7 @@ def _known(mean: object) -> float:
 
 
 def _word(run: FleetRun, cell: str, rate: float) -> str:
-    return verdict_of(run.cells[cell], run.fleet.problems[cell], rate).word
+    return verdict_of(run.cells[cell], run.fleet.problems[cell], rate, run.fleet.aim).word
 
 
 def _rounds(run: FleetRun) -> list[dict[str, Any]]:

@@ -6,8 +6,6 @@ import math
 
 from dwell.study.intervals import Interval
 
-#: Aim for a cell: a share of missed deadlines under 5 % (from the paper).
-AIM = 0.05
 #: The smallest number above 0, as a bound for "above 0".
 ABOVE_ZERO = math.ulp(0.0)
 

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from dwell.model.number_arrays import Floats
+from dwell.model.objective import AIM
 from dwell.study.intervals import Interval, mean_interval, median_interval, share_interval, under
-from dwell.study.kept_bounds import ABOVE_ZERO, AIM, keeps
+from dwell.study.kept_bounds import ABOVE_ZERO, keeps
 from dwell.study.over_seeds import difference_of, windows_behind
 from dwell.study.results import StudyRuns
 

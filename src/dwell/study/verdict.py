@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from dwell.model import Problem
+from dwell.model.objective import AIM
 from dwell.record import Run
 from dwell.study.independence import unit_of
 from dwell.study.intervals import share_interval, under
-from dwell.study.kept_bounds import AIM
 from dwell.study.metric import METRICS
 from dwell.study.over_seeds import WINDOW
 
@@ -50,13 +50,15 @@ class RunVerdict:
         )
 
 
-def verdict_of(run: Run, problem: Problem, rate: float) -> RunVerdict:
+def verdict_of(run: Run, problem: Problem, rate: float, aim: float = AIM) -> RunVerdict:
     """Judge a run by the windows after its warm-up.
 
     Parameters
     ----------
     rate : float
         V_D of the run's summary (`dwell.study.summary`).
+    aim : float
+        The run should miss a smaller share of its deadlines.
 
     Raises
     ------
@@ -68,9 +70,9 @@ def verdict_of(run: Run, problem: Problem, rate: float) -> RunVerdict:
     if run.is_simulated:
         cells = [(problem, str(run.meta["scenario"]))]
         if unit_of(cells, len(windows["warmup"])) != WINDOW:
-            return RunVerdict("open", rate, None, None, AIM)
+            return RunVerdict("open", rate, None, None, aim)
     interval = share_interval(rates, windows=len(rates))
     if not interval.known:
-        return RunVerdict("open", rate, None, None, AIM)
-    word = _WORDS[under(rates, AIM, windows=len(rates))]
-    return RunVerdict(word, rate, min(interval.low, rate), max(interval.high, rate), AIM)
+        return RunVerdict("open", rate, None, None, aim)
+    word = _WORDS[under(rates, aim, windows=len(rates))]
+    return RunVerdict(word, rate, min(interval.low, rate), max(interval.high, rate), aim)

@@ -227,6 +227,9 @@ def ros_cell(folder: Path, **changed: object) -> Path:
 def test_topics_of_a_node_are_checked(tmp_path: Path) -> None:
     assert call("check", ros_cell(tmp_path), "--node", "R1").exit_code == 0
     file = ros_cell(tmp_path, type="own_msgs/msg/Picture")
+    assert (
+        "tasks.camera.ros2.type: unknown type own_msgs/msg/Picture;" in call("check", file).stderr
+    )
     result = call("check", file, "--node", "R1")
     assert result.exit_code == 2
     assert "tasks.camera.run: unknown type own_msgs/msg/Picture; types of your own" in result.stderr
@@ -235,6 +238,7 @@ def test_topics_of_a_node_are_checked(tmp_path: Path) -> None:
         types.parent.mkdir(parents=True)
         types.write_text(f"{field}\n")
         file = ros_cell(tmp_path, type="own_msgs/msg/Picture", messages=folder)
+        assert ("ros2.type: " in call("check", file).stderr) == (folder == "wide")
         result = call("check", file, "--node", "R1")
         assert ("Picture.name: a wstring" in result.stderr) == (folder == "wide")
     assert result.exit_code == 0

@@ -1,4 +1,7 @@
 // Messages as Fast CDR writes them, the library of ROS 2: one line of hexadecimal digits each.
+#if !__has_include(<fastcdr/Cdr.h>)
+#error Fast CDR is not installed
+#endif
 #include <fastcdr/Cdr.h>
 #include <fastcdr/FastBuffer.h>
 

@@ -9,16 +9,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 from tests.ports import free_ports
-from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[3]
-#: Waits until a condition holds, on a busy machine too.
-until = partial(wait_until, patience_s=60.0)
 
 
 @dataclass

@@ -6,7 +6,6 @@ import struct
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from zenoh_ros2_sdk.utils import get_type_hash
@@ -14,19 +13,9 @@ from zenoh_ros2_sdk.utils import get_type_hash
 import dwell
 from dwell.errors import LiveError
 from dwell.live.ros2.message_types import decode, encode, message_types
+from examples.live.ros_stages import Twist, Vector
 
 TWIST = "geometry_msgs/msg/Twist"
-
-
-class Vector(msgspec.Struct):
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-
-class Twist(msgspec.Struct):
-    linear: Vector
-    angular: Vector
 
 
 #: Hashes that `ros2 topic info -v` prints in ROS 2 Jazzy.

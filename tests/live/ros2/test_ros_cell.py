@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +22,7 @@ from dwell import ros2
 from dwell.live.ros2.message_types import message_types
 from dwell.live.ros2.rmw_zenoh import QOS, Attachment, RosEndpoint, RosNode, Topic, gid
 from dwell.model.document import to_document
-from tests.cli.live_cell import EXAMPLE, RealCell
+from tests.cli.live_cell import EXAMPLE, RealCell, in_window
 from tests.live.ros2.ros_network import RosNetwork, kill, ros_network
 
 IMAGE, TWIST = "sensor_msgs/msg/Image", "geometry_msgs/msg/TwistStamped"
@@ -90,7 +92,7 @@ class RosRobot:
 
 
 @contextmanager
-def real_cell(folder: Path, network: RosNetwork) -> Iterator[RealCell]:
+def real_cell(folder: Path, network: RosNetwork, **controller: object) -> Iterator[RealCell]:
     """The example's cell of ROS topics, with the ports and times of a test."""
     cell = RealCell(folder)
     given = to_document(dwell.load(EXAMPLE / "ros2.yaml"))
@@ -102,7 +104,9 @@ def real_cell(folder: Path, network: RosNetwork) -> Iterator[RealCell]:
     camera["connect"] = actuators["control"]["ros2"]["connect"] = network.router
     actuators["control"]["ros2"]["type"] = TWIST
     document["live"] |= {"actuators": actuators, "silence": "zero"}
-    cell.module.with_name("ros_stages.py").write_text(STAMPED)
+    document["controller"] |= controller
+    document["tasks"]["control"]["run"] = "stamped:Steer"
+    cell.module.with_name("stamped.py").write_text(STAMPED)
     cell.file.write_text(yaml.safe_dump(document, sort_keys=False))
     cell.problem = dwell.load(cell.file)
     try:
@@ -114,23 +118,15 @@ def real_cell(folder: Path, network: RosNetwork) -> Iterator[RealCell]:
 #: The example's last stage for a base that takes stamped commands.
 STAMPED = """
 import msgspec
-from stages import Turn
+import ros_stages
 from dwell.live.stage import Message
 
-class Vector(msgspec.Struct):
-    z: float
-
-class Twist(msgspec.Struct):
-    angular: Vector
-
 class Stamped(msgspec.Struct):
-    twist: Twist
+    twist: ros_stages.Twist
 
-class Steer:
-    inputs = {"planning": Turn}
-
+class Steer(ros_stages.Steer):
     def process(self, inputs):
-        return Message(Stamped(Twist(Vector(-inputs["planning"].payload.rate))))
+        return Message(Stamped(super().process(inputs).payload))
 """
 
 
@@ -175,3 +171,35 @@ def test_a_cell_between_two_topics(tmp_path: Path) -> None:
             cell.until(lambda _: len(robot.commands) > count + 20)
         finally:
             robot.close()
+
+
+def test_killed_stages_between_two_topics_cost_at_most_the_bound_of_the_guard(
+    tmp_path: Path,
+) -> None:
+    guard_cycles = 20
+    with ExitStack() as stack:
+        network = stack.enter_context(ros_network())
+        network.start_router()
+        given = {"policy": "SO", "initial": "SO", "guard_cycles": guard_cycles}
+        cell = stack.enter_context(real_cell(tmp_path, network, **given))
+        robot = RosRobot(network)
+        try:
+            cell.controller()
+            for node in ("R2", "E", "R1"):
+                cell.agent(node)
+            cell.until(lambda status: in_window("SO")(status) and len(robot.commands) > 20)
+            # The agent would restart the workers.
+            cell.processes["agent-E"].kill()
+            for mark in cell.state("E").glob("*@E*.pid"):
+                with suppress(ProcessLookupError):
+                    os.kill(json.loads(mark.read_text())["pid"], signal.SIGKILL)
+            # Windows are recorded when they end.
+            cell.until(in_window("LOC"))
+        finally:
+            robot.close()
+        assert cell.end("controller") == 0
+        (folder,) = (cell.folder / "runs").iterdir()
+        run = dwell.open_run(folder)
+        assert "guard" in run.decisions["reason"].cast(str)
+        actuated = run.cycles.filter("actuated")["number"].to_numpy()
+        assert 0 < np.diff(actuated).max() - 1 <= guard_cycles + 1

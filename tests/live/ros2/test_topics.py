@@ -20,7 +20,8 @@ from dwell import ros2
 from dwell.errors import LiveError
 from dwell.live.ros2.rmw_zenoh import Attachment, RosEndpoint, RosNode, gid, read_token
 from dwell.live.stage import CellActuator, CellStage, Message, StagePlace
-from tests.live.ros2.ros_network import RosNetwork, kill, ros_network, until
+from tests.live.ros2.ros_network import RosNetwork, kill, ros_network
+from tests.waiting import wait_until
 
 STRING, VECTOR = "std_msgs/msg/String", "geometry_msgs/msg/Vector3"
 PLACE = StagePlace("hall", "camera", max_age_ms=60_000.0)
@@ -88,9 +89,11 @@ def test_commands_arrive_at_a_node(network: RosNetwork) -> None:
     sink = ros2.Sink("vec", VECTOR, namespace="/robot", connect=network.router)
     with started(sink):
         fields = {"x": 1.0, "y": 0.0, "z": -2.0}
-        until(lambda: arrives(sink, {"x": 1.0, "z": -2.0}, listener, fields), "fields")
+        wait_until(lambda: arrives(sink, {"x": 1.0, "z": -2.0}, listener, fields), "fields")
         data = ros2.encode({"y": 0.5}, VECTOR)
-        until(lambda: arrives(sink, data, listener, {"x": 0.0, "y": 0.5, "z": 0.0}), "CDR bytes")
+        wait_until(
+            lambda: arrives(sink, data, listener, {"x": 0.0, "y": 0.5, "z": 0.0}), "CDR bytes"
+        )
 
 
 def test_own_type_both_ways(network: RosNetwork, tmp_path: Path) -> None:
@@ -107,7 +110,7 @@ def test_own_type_both_ways(network: RosNetwork, tmp_path: Path) -> None:
         found = ros2.decode(source.process({}).payload, kind, path.parents[1])
         assert found.speeds.tolist() == [found.number + n for n in range(4)]
         fields = {"speeds": [1, 2, 3, 4], "number": 5}
-        until(lambda: arrives(sink, fields, listener, fields), "a message of the own type")
+        wait_until(lambda: arrives(sink, fields, listener, fields), "a message of the own type")
 
 
 def test_wire_form_of_commands(network: RosNetwork) -> None:
@@ -132,13 +135,13 @@ def test_wire_form_of_commands(network: RosNetwork) -> None:
         session.liveliness().declare_subscriber("@ros2_lv/5/**", token, history=True)
         sink = ros2.Sink("/vec", VECTOR, domain=5, connect=network.router, require_subscriber=False)
         with started(sink, StagePlace("hall", "control", 1)):
-            until(lambda: len(tokens) == 2, "a node and a publisher")
+            wait_until(lambda: len(tokens) == 2, "a node and a publisher")
             node, publisher = sorted(tokens, key=len)
-            until(lambda: sink.report().ready, "a router")
+            wait_until(lambda: sink.report().ready, "a router")
             for number in range(3):
                 sink.apply(Message({"x": float(number)}))
-            until(lambda: len(arrived) >= 3, "three messages")
-        until(lambda: not tokens, "the end of the tokens")
+            wait_until(lambda: len(arrived) >= 3, "three messages")
+        wait_until(lambda: not tokens, "the end of the tokens")
     found = read_token(publisher)
     assert isinstance(found, RosEndpoint)
     assert read_token(node) == found.node
@@ -164,7 +167,9 @@ def plain_publisher(
 
         publisher = session.declare_publisher(key + message_types().hash(kind))
         # Its type is declared as bool, and is not.
-        until(lambda: cast(Any, publisher.matching_status).matching, "the source's subscription")
+        wait_until(
+            lambda: cast(Any, publisher.matching_status).matching, "the source's subscription"
+        )
         yield publisher
 
 
@@ -178,7 +183,7 @@ def test_lost_messages_are_counted_by_publisher(network: RosNetwork) -> None:
         data = ros2.encode({"data": "x"}, STRING)
         for number, one in ((7, 1), (8, 1), (3, 2), (11, 1), (4, 2), (12, 1)):
             publisher.put(data, attachment=attached(number, bytes([one]) * 16))
-        until(lambda: source.rates().lost == 2, "two lost messages")
+        wait_until(lambda: source.rates().lost == 2, "two lost messages")
         source.wait()
 
 
@@ -237,10 +242,10 @@ def test_command_gets_the_stamp_of_its_frame(network: RosNetwork) -> None:
             count = len(stamps)
             return applied(sink, command) and len(stamps) > count
 
-        until(lambda: seen(Message({}, stamp_ns=5_000_000_007)), "a stamped command")
+        wait_until(lambda: seen(Message({}, stamp_ns=5_000_000_007)), "a stamped command")
         assert (stamps[-1].sec, stamps[-1].nanosec) == (5, 7)
-        until(lambda: seen(Message(ros2.encode({}, kind), stamp_ns=3)), "stamped bytes")
-        until(lambda: stamps[-1].nanosec == 3, "the stamp of the bytes")
+        wait_until(lambda: seen(Message(ros2.encode({}, kind), stamp_ns=3)), "stamped bytes")
+        wait_until(lambda: stamps[-1].nanosec == 3, "the stamp of the bytes")
 
 
 def test_late_source_gets_the_last_message(network: RosNetwork) -> None:
@@ -248,7 +253,7 @@ def test_late_source_gets_the_last_message(network: RosNetwork) -> None:
     options = {"qos": "transient_local", "connect": network.router}
     sink = ros2.Sink("/map", kind, require_subscriber=False, **options)
     with started(sink, StagePlace("hall", "map")):
-        until(lambda: applied(sink, Message({"data": "old"})), "a router")
+        wait_until(lambda: applied(sink, Message({"data": "old"})), "a router")
         source = ros2.Source("/map", kind, **options)
         with started(source):
             source.wait()
@@ -261,9 +266,9 @@ def test_silence_of_a_topic_fails_its_job_by_name(network: RosNetwork) -> None:
     with started(source, StagePlace("hall", "camera", max_age_ms=50.0)):
         source.wait()
         kill(talker)
-        until(lambda: not source.report().ready, "a report of silence")
+        wait_until(lambda: not source.report().ready, "a report of silence")
         assert "/chatter: no message for" in source.report().note
-        until(lambda: "no publisher" in source.report().note, "the end of the token")
+        wait_until(lambda: "no publisher" in source.report().note, "the end of the token")
         with pytest.raises(LiveError, match=r"/chatter: no message for .*: no publisher"):
             source.process({})
 
@@ -275,17 +280,17 @@ def test_frozen_publisher_is_named_by_its_missing_messages(network: RosNetwork) 
         source.wait()
         talker.send_signal(signal.SIGSTOP)
         try:
-            until(lambda: not source.report().ready, "a report of silence")
+            wait_until(lambda: not source.report().ready, "a report of silence")
         finally:
             talker.send_signal(signal.SIGCONT)
-        until(lambda: source.report().ready, "the next message")
+        wait_until(lambda: source.report().ready, "the next message")
 
 
 def test_publisher_of_another_type_is_an_error_with_both_names(network: RosNetwork) -> None:
     network.talk("/chatter", VECTOR)
     source = ros2.Source("/chatter", STRING, connect=network.router)
     with started(source):
-        until(lambda: VECTOR in source.report().note, "the publisher's token")
+        wait_until(lambda: VECTOR in source.report().note, "the publisher's token")
         assert f"as {VECTOR}, and dwell_hall_camera has {STRING}" in source.report().note
         assert not source.report().ready
 
@@ -299,7 +304,7 @@ def test_garbled_tokens_are_one_warning_and_all_else_goes_on(
         source = ros2.Source("/chatter", STRING, connect=network.router)
         with started(source):
             source.wait()
-            until(lambda: any("lidar" in one.message for one in caplog.records), "a warning")
+            wait_until(lambda: any("lidar" in one.message for one in caplog.records), "a warning")
             (line,) = {one.message for one in caplog.records if "lidar" in one.message}
             assert "%chatter" in line
 
@@ -307,7 +312,7 @@ def test_garbled_tokens_are_one_warning_and_all_else_goes_on(
 def test_commands_without_a_reader_are_not_applied(network: RosNetwork) -> None:
     sink = ros2.Sink("/vec", VECTOR, connect=network.router)
     with started(sink):
-        until(lambda: sink.report().ready, "a router")
+        wait_until(lambda: sink.report().ready, "a router")
         with pytest.raises(LiveError, match="/vec: no subscription"):
             sink.apply(Message({"x": 1.0}))
 
@@ -317,14 +322,14 @@ def test_no_router_at_the_start_and_later_one(mode: str) -> None:
     with ros_network() as network:
         sink = ros2.Sink("/vec", VECTOR, connect=network.router, mode=mode)
         with started(sink):
-            until(lambda: f"no router at {network.router}" in sink.report().note, "a note")
+            wait_until(lambda: f"no router at {network.router}" in sink.report().note, "a note")
             assert not sink.report().ready
             with pytest.raises(LiveError, match="no router at"):
                 sink.apply(Message({"x": 1.0}))
             network.start_router()
             listener = network.listen("/vec", VECTOR)
             fields = {"x": 1.0, "y": 0.0, "z": 0.0}
-            until(lambda: arrives(sink, fields, listener, fields), "router and subscription")
+            wait_until(lambda: arrives(sink, fields, listener, fields), "router and subscription")
 
 
 def test_killed_router_and_its_successor_in_client_mode() -> None:
@@ -336,11 +341,11 @@ def test_killed_router_and_its_successor_in_client_mode() -> None:
         with started(source), started(sink):
             source.wait()
             kill(router)
-            until(lambda: "no router" in sink.report().note, "a note of the sink")
+            wait_until(lambda: "no router" in sink.report().note, "a note of the sink")
             with pytest.raises(LiveError, match="/out: no router at"):
                 sink.apply(Message({"data": "x"}))
             network.start_router()
-            until(lambda: sink.report().ready and source.report().ready, "messages again")
+            wait_until(lambda: sink.report().ready and source.report().ready, "messages again")
             # The sink's token is back, too.
             tokens: list[str] = []
             with plain_session(network) as session:
@@ -356,7 +361,7 @@ def test_peers_go_on_without_the_router() -> None:
         source = ros2.Source("/chatter", STRING, connect=network.router)
         with started(source):
             source.wait()
-            until(lambda: source.rates().rate_hz > 0, "a rate")
+            wait_until(lambda: source.rates().rate_hz > 0, "a rate")
             time.sleep(1.0)  # the peers find each other through the router
             kill(router)
             source.wait()
@@ -375,14 +380,14 @@ def test_zero_message_is_published_and_hold_publishes_nothing(network: RosNetwor
     sink = ros2.Sink("/cmd", kind, connect=network.router, require_subscriber=False)
     with plain_session(network) as session, started(sink):
         session.declare_subscriber("0/cmd/**", take)
-        until(lambda: sink.report().ready, "a router")
+        wait_until(lambda: sink.report().ready, "a router")
 
         def zeroed() -> bool:
             sink.hold()
             sink.zero()
             return heard.acquire(timeout=0.2)
 
-        until(zeroed, "a zero message")
+        wait_until(zeroed, "a zero message")
     assert set(payloads) == {b"\0\1\0\0" + bytes(48)}
     # A type without a message that stops: zero() publishes nothing, with or without a router.
     ros2.Sink("/joints", "trajectory_msgs/msg/JointTrajectory").zero()

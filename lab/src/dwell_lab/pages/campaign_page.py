@@ -12,7 +12,7 @@ from dwell.model.bounds import counted
 from dwell.report.charts import NO_LIMIT, cumulative
 from dwell.report.figure import Figure
 from dwell.report.formatting import percent, shown_contender
-from dwell.report.page import Block, Fact, Page, Section, page_html
+from dwell.report.page import Block, Fact, Page, Section
 from dwell.report.palette import ramp_styles
 from dwell.report.policy_blocks import PolicyBlocks, named
 from dwell.report.table import Columns, Table, Text, table_text
@@ -28,11 +28,6 @@ DEADLINES = 4
 #: Metrics of windows.
 SHOWN = ("violation_rate", "l95_ms", "u_robot", "u_edge")
 WHERE = {"testbed": "the testbed"}
-
-
-def campaign_html(measured: MeasuredCampaign, *, static: bool = False) -> str:
-    """Return the page of a campaign, also before its end; see `dwell.report.page.page_html`."""
-    return page_html(campaign_page(measured), static=static)
 
 
 def campaign_page(measured: MeasuredCampaign) -> Page:

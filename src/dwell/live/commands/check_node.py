@@ -105,7 +105,7 @@ def check_node(
 
 def _open_topics(problem: Problem, node: str) -> Iterator[str]:
     """Yield a warning for each ROS topic of a node that is not encrypted, in a cell with keys."""
-    for path, topic in ros_topics(problem, node).items():
+    for path, topic in ros_topics(problem, {node}).items():
         from dwell.live.ros2.ros_session import is_encrypted
 
         if not is_encrypted(topic):

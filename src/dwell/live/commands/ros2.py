@@ -1,13 +1,16 @@
-"""`dwell ros2`: the state of a live cell for ROS 2."""
+"""`dwell ros2`: the state of a live cell for ROS 2; unknown types of topics for `dwell check`."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Annotated
 
 import typer
 
 from dwell.cli.options import CellArgument, Insecure, Keys, flag, option
+from dwell.errors import Fault, LiveError, not_installed
+from dwell.model import Problem
 
 #: Seconds between two messages.
 EVERY_S = 1.0
@@ -33,7 +36,6 @@ def diagnostics(
 ) -> None:
     """Publish the state of a cell on /diagnostics, once per second."""
     import dwell
-    from dwell.errors import LiveError
     from dwell.live.host.operator_client import OperatorClient
     from dwell.live.host.security import environment
     from dwell.live.ros2.diagnostics import TOPIC, TYPE
@@ -64,3 +66,18 @@ def diagnostics(
                 time.sleep(max(until_s - time.monotonic(), 0.0))
     finally:
         sink.stop()
+
+
+def unknown_types(problem: Problem) -> Iterator[Fault]:
+    """Yield the topics whose types are unknown; none if a package is missing here."""
+    if not_installed("live", "ros2"):
+        return
+    from dwell.live.host.stage_modules import ros_topics
+
+    for path, topic in ros_topics(problem, problem.fabric.nodes).items():
+        from dwell.live.ros2.message_types import types_of
+
+        try:
+            types_of(topic, problem.folder)
+        except LiveError as error:
+            yield Fault(f"{path}.type", str(error))

@@ -114,7 +114,7 @@ def unit_texts(
         called = f"Dwell controller of cell {problem.name}"
         name = f"dwell-controller@{escaped_name(problem.name)}.service"
         units[name] = unit(called, controller, CONTROLLER)
-        if any(ros_topics(problem, one) for one in problem.fabric.nodes):
+        if ros_topics(problem, problem.fabric.nodes):
             called = f"ROS 2 diagnostics of cell {problem.name}"
             text = unit(called, ("ros2", "diagnostics", str(cell)), "")
             name = f"dwell-diagnostics@{escaped_name(problem.name)}.service"

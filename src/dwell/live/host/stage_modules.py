@@ -37,7 +37,7 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     names: dict[str, str | RosActuator | None]
     names = {f"tasks.{task.name}.run": task.run for task in tasks}
     names |= {f"live.actuators.{task.name}": actuators.get(task.name) for task in tasks}
-    if any(ros_topics(problem, node) for node in nodes) and (packages := lacking("ros2")):
+    if ros_topics(problem, nodes) and (packages := lacking("ros2")):
         raise LiveError(packages)
     for where, name in names.items():
         if not isinstance(name, str):
@@ -51,14 +51,16 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
             raise missing or error from cause
 
 
-def ros_topics(problem: Problem, node: str) -> dict[str, RosTopic]:
-    """Return the ROS topics at the ends of the cell on a node, by their paths in the cell file."""
+def ros_topics(problem: Problem, nodes: Collection[str]) -> dict[str, RosTopic]:
+    """Return the ROS topics at the ends of the cell on some nodes, by path in the cell file."""
     found: dict[str, RosTopic] = {}
     for name, task in problem.pipeline.tasks.items():
+        if task.on.keys().isdisjoint(nodes):
+            continue
         actuator = problem.live.actuators.get(name)
-        if node in task.on and task.ros2 is not None:
+        if task.ros2 is not None:
             found[f"tasks.{name}.ros2"] = task.ros2
-        if node in task.on and isinstance(actuator, RosActuator):
+        if isinstance(actuator, RosActuator):
             found[f"live.actuators.{name}.ros2"] = actuator.ros2
     return found
 

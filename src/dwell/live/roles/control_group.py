@@ -14,35 +14,27 @@ UNKNOWN = -1
 PROCESS = Path("/proc/self")
 #: File with the CPU time in a group's folder, in versions 1 and 2.
 COUNTERS = {"cgroup": "cpuacct.usage", "cgroup2": "cpu.stat"}
-#: File with the CPU time per CPU, only in version 1.
-BY_CPU = "cpuacct.usage_percpu"
 
 
 class Counts(NamedTuple):
-    """CPU time used by others than this process, ns; `UNKNOWN` if the kernel does not count it.
+    """CPU time used by a control group, ns; `UNKNOWN` if the kernel does not count it.
 
     Parameters
     ----------
     others_ns : int
-        CPU time of the other processes of its group.
-    outside_ns : int
-        CPU time of processes outside the group, on the CPUs that this process may use; version 2
-        does not count it.
+        CPU time of all its processes except this one.
     group_ns : int
-        CPU time of its group, including this process.
+        CPU time of all its processes.
     """
 
     others_ns: int = UNKNOWN
-    outside_ns: int = UNKNOWN
     group_ns: int = UNKNOWN
 
-    def since(self, before: Counts) -> tuple[int, int]:
-        """Return the CPU time since then of others in the group, and of processes outside, ns."""
-        others_ns, outside_ns = (
-            UNKNOWN if UNKNOWN in (then, now) else max(now - then, 0)
-            for then, now in zip(before[:2], self[:2], strict=True)
-        )
-        return others_ns, outside_ns
+    def others_since(self, before: Counts) -> int:
+        """Return the CPU time of the other processes since then, ns."""
+        if UNKNOWN in (before.others_ns, self.others_ns):
+            return UNKNOWN
+        return max(self.others_ns - before.others_ns, 0)
 
 
 class _Counter:
@@ -70,14 +62,11 @@ class ControlGroup:
     ----------
     counter : Path
         ``cpuacct.usage`` (version 1, nanoseconds) or ``cpu.stat`` (version 2, microseconds).
-    root : Path
-        Folder of the root group.
     """
 
-    def __init__(self, counter: Path, root: Path = Path()) -> None:
+    def __init__(self, counter: Path) -> None:
         self._nanoseconds = counter.name == COUNTERS["cgroup"]
         self._path, self._used = counter, _Counter(counter)
-        self._by_cpu = [_Counter(folder / BY_CPU) for folder in (root, counter.parent)]
 
     def used_ns(self) -> int:
         """Return the CPU time of all its processes, including ended ones, ns.
@@ -107,17 +96,7 @@ class ControlGroup:
         group_ns = self.taken_ns()
         if group_ns == UNKNOWN:
             return Counts()
-        return Counts(group_ns - own_ns, self._outside_ns(), group_ns)
-
-    def _outside_ns(self) -> int:
-        taken, cpus = [], os.sched_getaffinity(0)
-        for counter in self._by_cpu:
-            try:
-                by_cpu = counter.read().split()
-                taken.append(sum(int(by_cpu[cpu]) for cpu in cpus))
-            except (OSError, ValueError, IndexError):
-                return UNKNOWN
-        return taken[0] - taken[1]
+        return Counts(group_ns - own_ns, group_ns)
 
 
 def own_group(process: Path = PROCESS) -> ControlGroup | None:
@@ -134,7 +113,7 @@ def own_group(process: Path = PROCESS) -> ControlGroup | None:
             continue
         counter = folder / group.removeprefix(root).lstrip("/") / COUNTERS[kind]
         if group != root and counter.is_file():
-            return ControlGroup(counter, folder)
+            return ControlGroup(counter)
     return None
 
 

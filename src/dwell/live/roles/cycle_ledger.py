@@ -523,7 +523,6 @@ class Ledger:
         counted_ns = {
             "cpu_ns": hop.cpu_ns,
             "others_ns": hop.others_ns,
-            "outside_ns": hop.outside_ns,
             "handover_ns": self._handover_ns(cycle, jobs, hop, shadow=shadow),
             "ending_ns": UNKNOWN if shadow else self._ending_ns(cycle, hop),
         }

@@ -361,7 +361,7 @@ class Worker:
         inputs = tuple((source, at_ns) for source, (_, _, at_ns) in job.inputs.items())
         times = job.arrived_ns, started_ns, ended_ns
         before, cpu_ns, after = self._counted
-        spent = cpu_ns, *after.since(before)
+        spent = cpu_ns, after.others_since(before)
         group_ns = before.group_ns, after.group_ns
         stamp_ns, here = output.stamp_ns, (self.task, place.node)
         hop = Hop(*here, *times, inputs, state_age, *spent, group_ns, warmup, stamp_ns)

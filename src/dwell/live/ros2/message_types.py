@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from dwell.errors import LiveError, installing
+from dwell.model.ros_topics import RosTopic
 
 if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc
@@ -62,6 +63,17 @@ def encode(value: Any, type: str, messages: str | Path | None = None) -> bytes:
         If the type is unknown or has no such field, or a value does not fit.
     """
     return message_types(messages).encode(value, type)
+
+
+def types_of(topic: RosTopic, folder: str | None) -> MessageTypes:
+    """Return the types of a topic; raise a LiveError if its type is unknown or cannot be read.
+
+    `folder` is the folder of the cell file.
+    """
+    own = topic.messages
+    found = message_types(None if own is None else Path(folder or ".", own))
+    found.require(topic.type)
+    return found
 
 
 def message_types(folder: str | Path | None = None) -> MessageTypes:

@@ -8,13 +8,12 @@ import os
 import re
 import threading
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError, installing
 from dwell.live.failures import start_thread
 from dwell.live.ros2 import matching
-from dwell.live.ros2.message_types import MessageTypes, message_types
+from dwell.live.ros2.message_types import types_of
 from dwell.live.ros2.rmw_zenoh import (
     ADMIN,
     PUBLISHER,
@@ -132,10 +131,7 @@ class RosSession:
         except ImportError as error:
             raise LiveError(f"{error.name} is not installed; {installing('ros2')}") from None
         settings = self.settings
-        folder = settings.messages
-        if folder is not None:
-            folder = str(Path(self._place.folder or ".", folder))
-        self.types: MessageTypes = message_types(folder)
+        self.types = types_of(settings, self._place.folder)
         self.topic = Topic(settings.resolved, settings.type, self.types.hash(settings.type))
         qos = QOS[settings.qos]
         depth = settings.depth or qos.depth

@@ -109,9 +109,8 @@ class Hop(_Array, frozen=True):
         otherwise.
     cpu_ns : int
         CPU time from its start on (see `Worker.run`); -1 if the stage was not called.
-    others_ns, outside_ns : int
-        CPU time during the call of other processes in the worker's control group, and of processes
-        outside it on the worker's CPUs; -1 if unknown.
+    others_ns : int
+        CPU time during the call of other processes in the worker's control group; -1 if unknown.
     group_ns : tuple of int
         CPU time that the group had used at the start of the job and when the stage returned.
     warmup : bool
@@ -129,7 +128,6 @@ class Hop(_Array, frozen=True):
     state_age: Annotated[int, msgspec.Meta(ge=-1, lt=NEVER_NS)] = -1
     cpu_ns: Spent = -1
     others_ns: Spent = -1
-    outside_ns: Spent = -1
     group_ns: tuple[Spent, Spent] = (-1, -1)
     warmup: bool = False
     stamp_ns: Instant | None = None
