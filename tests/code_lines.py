@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 25_999, "live": 15_598, "lab": 6_818}
+MOST = {"simulator": 26_033, "live": 15_615, "lab": 6_818}
 
 
 def code_lines(text: str) -> int:

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from dwell.live.wire.messages import Header, Hop
+from dwell.model.pipeline import LONGEST_DEADLINE
 
-#: Largest number of cycles that wait for the rest of their inputs.
-MAX_JOINS = 64
+#: Largest number of cycles that wait for the rest of their inputs: those of the longest deadline.
+MAX_JOINS = LONGEST_DEADLINE
 #: Header, payload and time of arrival by source task.
 Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
 
@@ -45,20 +46,31 @@ class Job:
 
 @dataclass(slots=True)
 class Joins:
-    """Inputs of incomplete cycles; when a later cycle is complete, earlier cycles are evicted.
+    """Inputs of incomplete cycles; a complete cycle evicts earlier ones whose deadline has passed.
 
-    `drop` gets the headers of inputs that are too late or evicted.
+    These are `open_cycles` or more before it. `drop` gets the headers of inputs that are too late
+    or evicted.
     """
 
     sources: frozenset[str]
     drop: Callable[[Iterable[Header]], None]
+    open_cycles: int = 1
     waiting: dict[tuple[int, int], Inputs] = field(default_factory=dict)
     newest: tuple[int, int] = (-1, -1)
+    # Complete cycles among the newest `open_cycles`.
+    done: set[tuple[int, int]] = field(default_factory=set)
+
+    @property
+    def _last_over(self) -> tuple[int, int]:
+        """The last cycle whose inputs are too late."""
+        run, number = self.newest
+        return run, number - self.open_cycles
 
     def add(self, header: Header, payload: bytes, at_ns: int) -> Inputs | None:
         """Add an input; return the set of its cycle's inputs if it is now complete."""
         cycle = header.stamp.key
-        if cycle <= self.newest or header.source not in self.sources:
+        late = cycle <= self._last_over or cycle in self.done
+        if late or header.source not in self.sources:
             self.drop([header])
             return None
         inputs = self.waiting.setdefault(cycle, {})
@@ -67,9 +79,11 @@ class Joins:
             if len(self.waiting) > MAX_JOINS:
                 self._evict(min(self.waiting))
             return None
-        self.newest = cycle
+        self.newest = max(self.newest, cycle)
         del self.waiting[cycle]
-        for other in [other for other in self.waiting if other < cycle]:
+        last = self._last_over
+        self.done = {other for other in (*self.done, cycle) if other > last}
+        for other in [other for other in self.waiting if other <= last]:
             self._evict(other)
         return inputs
 

@@ -251,7 +251,7 @@ class StateTransfer:
     @property
     def _too_slow(self) -> bool:
         """Whether a checkpoint takes so long that the guard would move the cell."""
-        return self._cost_ns > self.place.patience_ns
+        return self._cost_ns > self.place.problem.guard_patience_ns
 
     def plan_checkpoint(self, job: Job, now_ns: int) -> None:
         """Plan a checkpoint every `checkpoint_cycles`, if they use at most 1/20 of the time."""

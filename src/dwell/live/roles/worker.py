@@ -76,9 +76,10 @@ class Worker:
         self.book = book or StageBook(problem, task, place.node)
         self.book.begin()
         self._warmup = problem.pipeline.tasks[task].warmup_jobs
+        overlap = problem.pipeline.open_cycles
         self._joins = {
-            MAIN: Joins(sources, lambda headers: self.book.ended(headers, DROPPED)),
-            SHADOW: Joins(sources, lambda _: None),
+            MAIN: Joins(sources, lambda headers: self.book.ended(headers, DROPPED), overlap),
+            SHADOW: Joins(sources, lambda _: None, overlap),
         }
         #: CPU clock of a job: this thread's, or the process's if the cell file gives the stage
         #: several threads.
@@ -178,7 +179,9 @@ class Worker:
         else:
             self._jobs.append(job)
             if len(self._jobs) > (self._depth or 10 * MAX_JOINS):
-                self._replace(self._jobs.popleft())
+                # Of the oldest waiting job and the new job, the earlier cycle.
+                overtaken = job.order < self._jobs[0].order
+                self._replace(self._jobs.pop() if overtaken else self._jobs.popleft())
 
     def _replace(self, job: Job) -> None:
         """Report a job that a later cycle has replaced."""
