@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
-from dwell.errors import LiveError, missing_package, not_installed
+from dwell.errors import LiveError, lacking, missing_package
 from dwell.live.stage import (
     CellActuator,
     CellCode,
@@ -37,9 +37,8 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     names: dict[str, str | RosActuator | None]
     names = {f"tasks.{task.name}.run": task.run for task in tasks}
     names |= {f"live.actuators.{task.name}": actuators.get(task.name) for task in tasks}
-    packages = " and ".join(not_installed("ros2"))
-    if packages and ros_topics(problem, nodes):
-        raise LiveError(f"{packages} not installed; in a checkout of Dwell: pip install '.[ros2]'")
+    if ros_topics(problem, nodes) and (packages := lacking("ros2")):
+        raise LiveError(packages)
     for where, name in names.items():
         if not isinstance(name, str):
             continue
