@@ -65,7 +65,7 @@ class Timed(Corrected):
     @property
     def cycles(self) -> int:
         """Cycles that have been played."""
-        return self._playing.cycles
+        return self._player.cycles
 
 
 def measure(quick: bool) -> Section:

@@ -247,7 +247,6 @@ def may_import(importer: str, imported: str) -> bool:
 
 #: Functions with more lines than `MOST_LINES`; the list may only shrink.
 LONG = {
-    "dwell/estimators/prices.py:price_of",
     "dwell/kernels/arrays.py:_Layout._tables",
     "dwell/live/host/node.py:run_agent",
     "dwell/live/host/node.py:run_controller",

@@ -10,7 +10,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 #: Most uses of private names in all tests.
-MOST = 58
+MOST = 57
 #: Public names that begin with an underscore: of named tuples, notebooks and `os`.
 PUBLIC = {"_asdict", "_exit", "_fields", "_make", "_replace", "_repr_html_"}
 #: Functions that replace an attribute, whose name they get as a string.
@@ -26,9 +26,8 @@ SEEN = "compares an intermediate result with an independent one"
 USES: dict[str, dict[str, str]] = {
     "tests/control/test_guard.py": {"_silence": BOUND, "_spent_ns": SEEN},
     "tests/control/test_ledger_sets.py": {"_price": COST},
+    "tests/estimators/test_candidate_player.py": {"_twins": SEEN},
     "tests/estimators/test_corrected.py": {"_pools": SEEN},
-    "tests/estimators/test_fleet_prices.py": {"_twins": SEEN},
-    "tests/estimators/test_prices.py": {"_known": COST},
     "tests/estimators/test_waits.py": {"_take_in": SEEN},
     "tests/kernels/test_library.py": {"_handle": SEEN},
     "tests/live/host/test_hosting.py": {"_due_ns": RACE},

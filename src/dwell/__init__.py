@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from dwell.cellfile import load
     from dwell.cellfile.fleet_file import load_fleet
     from dwell.errors import DwellError
+    from dwell.estimators.placement_search import search
     from dwell.record import Run, open_run
     from dwell.sim import Realisation, draw, simulate, simulate_realisation
     from dwell.sim.fleet import simulate_fleet
@@ -24,6 +25,7 @@ __all__ = [
     "load",
     "load_fleet",
     "open_run",
+    "search",
     "simulate",
     "simulate_fleet",
     "simulate_realisation",
@@ -35,6 +37,7 @@ _HOME = {
     "load_fleet": "dwell.cellfile.fleet_file",
     "Run": "dwell.record",
     "open_run": "dwell.record",
+    "search": "dwell.estimators.placement_search",
     "Realisation": "dwell.sim",
     "draw": "dwell.sim",
     "simulate": "dwell.sim",

@@ -18,7 +18,7 @@ from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.fleet_rank import MostServed
 from dwell.control.ledger import FleetLedger, Loads, PricedCell, Seat
 from dwell.estimators.load_table import LoadColumn, LoadTable
-from dwell.estimators.presents import Present
+from dwell.estimators.present import Present
 from dwell.model import Decision, FrozenDict, Problem, QoS
 from dwell.model.fleet import FleetObjective
 from dwell.model.process import Constant

@@ -12,7 +12,7 @@ from dwell.control.fleet_rank import MostServed, fleet_rank
 from dwell.control.ledger import FleetLedger
 from dwell.estimators.fleet_prices import CellPrice, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.measured import Site
-from dwell.estimators.presents import Present
+from dwell.estimators.present import Present
 from dwell.estimators.protocol import CellEstimator
 from dwell.model import Decision, FrozenDict, Problem, QoS
 from dwell.model.fleet import FleetObjective

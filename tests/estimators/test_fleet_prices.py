@@ -12,12 +12,9 @@ import pytest
 import dwell
 from dwell.estimators.fleet_prices import CellPrice, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
-from dwell.estimators.measured import Message, Site
-from dwell.estimators.presents import Playing, Present, realised
+from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED, prices_of
-from dwell.kernels.advance import play
-from dwell.kernels.arrays import lay_out
-from dwell.model import FrozenDict, Problem
+from dwell.model import FrozenDict
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.sim.fleet import phased, priced_cells, simulate_fleet
 from tests.cells.once import with_windows
@@ -112,35 +109,6 @@ def test_cells_of_several_kinds_are_played_for_about_as_long() -> None:
     prices = priced(fleet_of(FleetEntry(CANONICAL, 1), FleetEntry(FAN_IN, 1), shared=()))
     price = prices.price(tuple(next(iter(cell.problem.candidates)) for cell in prices.cells))
     assert all(cell_of(price, i).cost > 0 for i in range(2))
-
-
-def presents(problem: Problem) -> dict[str, Present]:
-    rng = np.random.default_rng(3)
-    site, message = Site("perception", "E"), Message("sensing", "perception", "R1->E")
-    late = rng.uniform(1, 9, 70)
-    late[::10] = np.inf
-    return {
-        "demands": Present(FrozenDict({site: rng.uniform(5, 20, 37), message: late})),
-        "threads": Present(threads=FrozenDict({"R1": 2.4, "E": -0.5})),
-        "down": Present(down=frozenset({"R2"})),
-    }
-
-
-@pytest.mark.parametrize("name", ["demands", "threads", "down"])
-def test_a_present_is_played_as_estimators_play_it(name: str) -> None:
-    present = presents(CANONICAL)[name]
-    playing = Playing(CANONICAL)
-    playing.begin(present)
-    names = list(CANONICAL.candidates)
-    playing.go_on(present, names, steps=4)
-    real = realised(CANONICAL, playing.declared.realisation, present)
-    for index, candidate in enumerate(names):
-        arrays = lay_out([(CANONICAL, real)])
-        arrays.replace(stamps=np.full_like(arrays.tables.stamps, index))
-        play(arrays)
-        seen = arrays.tables.seen[0, 1:4]
-        twin = playing._twins[candidate].arrays.tables.seen[0, 1:4]
-        assert seen.tolist() == twin.tolist()
 
 
 def test_of_a_shared_node_the_middle_of_what_cells_say_holds() -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
-from random import Random
 
 import pytest
 
 import dwell
 from dwell.estimators import prices
+from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.prices import (
     MOST_CYCLES,
     SETTLING,
@@ -193,7 +193,7 @@ def test_a_price_is_the_mean_of_the_windows_of_a_run(seed: int) -> None:
     windows = SETTLING + 3
     realisation = draw(problem, scenario="baseline", seed=seed, windows=windows)
     for name in problem.candidates:
-        price = price_of(problem, realisation, name)
+        price = price_of(CandidatePlayer([(problem, realisation)]), name)
         run = dwell.simulate_realisation(problem, realisation, policy=name, estimator=AsSeen())
         counted = run.windows[SETTLING:]
         assert price.l95_ms == counted["seen_l95_ms"].to_numpy().mean()
@@ -206,8 +206,9 @@ def test_a_price_with_shadows_is_the_mean_of_the_windows_of_a_run_with_them(seed
     windows, fraction = SETTLING + 3, 0.5 / max(len(problem.candidates) - 1, 1)
     realisation = draw(problem, scenario="baseline", seed=seed, windows=windows)
     shadows = SentShadows(problem, realisation, fraction)
+    player = CandidatePlayer([(problem, realisation)], shadows=shadows)
     for name in hindered(problem):
-        price = price_of(problem, realisation, name, shadows)
+        price = price_of(player, name)
         run = dwell.simulate_realisation(
             problem, realisation, policy=name, estimator=AsSeen(fraction)
         )
@@ -250,7 +251,7 @@ def test_a_price_is_what_long_runs_of_random_dags_come_to(seed: int) -> None:
     problem = random_dag(seed)
     realisation = draw(problem, scenario="baseline", seed=1_000 + seed, windows=1_000)
     for name, price in prices_of(problem).items():
-        long = price_of(problem, realisation, name)
+        long = price_of(CandidatePlayer([(problem, realisation)]), name)
         l95_error_ms = math.hypot(price.l95_error_ms, long.l95_error_ms)
         assert abs(price.l95_ms - long.l95_ms) <= 4 * l95_error_ms + 1e-9
         error = math.hypot(price.violation_error, long.violation_error)
@@ -295,21 +296,15 @@ def test_a_scenario_has_prices_of_its_own() -> None:
     assert stressed["LOC"].violation_rate > prices_of(problem)["LOC"].violation_rate + 0.5
 
 
-def test_a_play_is_a_fixed_number() -> None:
-    rng = Random(3)
-    problem = chain(rng.uniform(0.5, 1.0))
-    first = only(problem)
-    prices._known.clear()
-    assert only(problem) == first
-
-
 def test_prices_are_handed_over_and_few_are_kept() -> None:
-    problem = chain(0.1)
+    problem = chain(0.7)
     first = prices_of(problem)
-    handed = prices.known_prices()
+    handed = prices.KNOWN_PRICES.known
     for seed in range(prices.KEPT):
         prices_of(problem, seed=seed, cycles=1)
-    assert len(prices.known_prices()) == prices.KEPT
-    assert prices_of(problem) is not first
-    prices.take_over(handed)
+    assert len(prices.KNOWN_PRICES.known) == prices.KEPT
+    again = prices_of(problem)
+    assert again is not first
+    assert again == first
+    prices.KNOWN_PRICES.add(handed)
     assert prices_of(problem) is first

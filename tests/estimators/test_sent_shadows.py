@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 import dwell
+from dwell.estimators.candidate_player import CandidatePlayer
+from dwell.estimators.declared_cell import declared_of
 from dwell.estimators.measured import Site
-from dwell.estimators.presents import Playing, Present, declared_of
+from dwell.estimators.present import Present
 from dwell.estimators.prices import prices_of
-from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
-from dwell.kernels.arrays import lay_out
+from dwell.estimators.sent_shadows import SentShadows, hindered
+from dwell.estimators.stepwise_player import StepwisePlayer
 from dwell.kernels.random_draws import draw
 from dwell.model import (
     Constant,
@@ -105,7 +107,7 @@ def test_a_quota_of_both_hinders() -> None:
 def test_the_canonical_cell_is_priced_without_shadows() -> None:
     problem = dwell.load(EXAMPLES / "canonical.yaml")
     assert hindered(problem) == set()
-    plain, own = Playing(problem), Playing(problem, shadow_fraction=FRACTION)
+    plain, own = StepwisePlayer(problem), StepwisePlayer(problem, shadow_fraction=FRACTION)
     assert own.prices is plain.prices
     assert own.declared is plain.declared
     assert own.declared.shadows is None
@@ -118,9 +120,9 @@ def test_cycles_of_hindered_candidates_alone_are_sent_through_others() -> None:
     problem = fork(kilobytes=100, rate_mbps=100.0)
     real = draw(problem, scenario="baseline", seed=1, windows=4)
     shadows = SentShadows(problem, real, FRACTION)
-    arrays = lay_out([(problem, real)], shadows=[shadows.realisation])
+    player = CandidatePlayer([(problem, real)], shadows=shadows)
     for index, sent in enumerate([shadow_stamps(0, 200, 0, 2, FRACTION), np.full(200, -1)]):
-        stamps = stamps_of(arrays, index, shadows)
+        stamps = player.tables({0: list(problem.candidates)[index]}).tables.stamps
         np.testing.assert_array_equal(stamps, [np.full(200, index), sent])
 
 
@@ -128,11 +130,11 @@ def test_cycles_of_hindered_candidates_alone_are_sent_through_others() -> None:
 
 
 @pytest.fixture(scope="module")
-def playing() -> Playing:
-    return Playing(random_dag(40), shadow_fraction=FRACTION)
+def playing() -> StepwisePlayer:
+    return StepwisePlayer(random_dag(40), shadow_fraction=FRACTION)
 
 
-def test_what_is_as_declared_is_played_as_declared(playing: Playing) -> None:
+def test_what_is_as_declared_is_played_as_declared(playing: StepwisePlayer) -> None:
     names = tuple(playing.problem.candidates)
     site = next(Site(*site) for site in playing.declared.realisation.sites)
     playing.begin(Present(FrozenDict({site: np.array([100.0])})))
@@ -147,7 +149,9 @@ def test_what_is_as_declared_is_played_as_declared(playing: Playing) -> None:
         assert played.violation_rate == price.violation_rate
 
 
-def test_only_what_hindered_candidates_show_as_declared_is_different(playing: Playing) -> None:
+def test_only_what_hindered_candidates_show_as_declared_is_different(
+    playing: StepwisePlayer,
+) -> None:
     problem, declared = playing.problem, playing.declared
     plain = declared_of(problem)
     assert declared.references is plain.references
@@ -168,7 +172,7 @@ def test_shadow_jobs_meet_the_present_too() -> None:
     edge = Node("E", "edge", 4, accelerators={"gpu": 1})
     # Declared, B is done before C is due.
     problem = fork(edge=edge, gpu="gpu", b_ms=Constant(0.01))
-    playing = Playing(problem, shadow_fraction=0.5)
+    playing = StepwisePlayer(problem, shadow_fraction=0.5)
     alone_ms = playing.prices["LOC"].l95_ms
     playing.begin(Present(FrozenDict({Site("B", "E"): np.array([120.0])})))
     playing.go_on(playing.present, ["LOC"], 3)

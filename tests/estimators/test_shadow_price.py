@@ -11,7 +11,7 @@ import pytest
 import dwell
 from dwell.control import Controller
 from dwell.estimators import Corrected
-from dwell.estimators.prices import known_prices
+from dwell.estimators.prices import KNOWN_PRICES
 from dwell.estimators.sent_shadows import hindered
 from dwell.estimators.shadow_price import affordable, fraction_of, shadow_prices
 from dwell.model import Problem
@@ -34,10 +34,10 @@ def auto(problem: Problem, **settings: Any) -> Problem:
 
 def test_a_placement_whose_jobs_never_wait_for_shadows_gets_the_largest_share() -> None:
     problem = auto(CANONICAL)
-    before = known_prices().keys()
+    before = KNOWN_PRICES.known.keys()
     assert fraction_of(problem) == dict.fromkeys(("LOC", "SO", "HYB"), 0.05)
     # That needs no simulation.
-    assert known_prices().keys() == before
+    assert KNOWN_PRICES.known.keys() == before
 
 
 def test_the_share_is_the_largest_whose_price_is_small() -> None:
@@ -103,19 +103,19 @@ def test_no_share_costs_more_than_is_allowed(seed: int) -> None:
 
 def test_prices_are_kept_by_content() -> None:
     first = shadow_prices(camera())
-    known = known_prices().keys()
+    known = KNOWN_PRICES.known.keys()
     assert shadow_prices(camera()) == first
     assert fraction_of(replace(camera(), name="another")) == fraction_of(camera())
-    assert known_prices().keys() == known
+    assert KNOWN_PRICES.known.keys() == known
 
 
 @pytest.mark.parametrize("estimator", ["profile", "scaling"])
 def test_an_estimator_without_shadows_gets_none(estimator: str) -> None:
     problem = camera(estimator=estimator, min_improvement=0.017)
-    before = known_prices().keys()
+    before = KNOWN_PRICES.known.keys()
     controller = Controller(problem)
     assert controller.shadow_fractions == {"LOC": 0.0, "OFF": 0.0}
-    assert not [one for one in known_prices().keys() - before if one.cycles]
+    assert not [one for one in KNOWN_PRICES.known.keys() - before if one.cycles]
 
 
 def test_a_share_that_is_given_in_python_goes_before_auto() -> None:

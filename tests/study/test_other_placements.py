@@ -26,3 +26,12 @@ def test_the_initial_placement_is_first_and_some_are_left_out() -> None:
     assert problem.initial == "HYB"
     drawn = dwell.draw(problem, seed=1, windows=8)
     assert list(other_placements(problem, drawn, most=2)) == ["HYB", "LOC"]
+
+
+def test_a_known_run_is_not_simulated_again() -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    drawn, other = (dwell.draw(problem, seed=seed, windows=8) for seed in (1, 2))
+    known = {"SO": dwell.simulate_realisation(problem, other, policy="SO")}
+    found = other_placements(problem, drawn, known=known)
+    assert found["SO"] == other_placements(problem, other)["SO"]
+    assert found["LOC"] == other_placements(problem, drawn)["LOC"]

@@ -10,6 +10,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 
 from dwell import __version__
+from dwell.cli.candidates import candidates
 from dwell.cli.check import check
 from dwell.cli.completion import completion
 from dwell.cli.demo import demo
@@ -27,7 +28,7 @@ from dwell.model.entry_points import COMMANDS, added
 SHORT = 64
 #: Headings of the help, with their commands; the others follow under `Other`.
 GROUPS = {
-    "Simulate": ("new", "check", "run", "study", "demo"),
+    "Simulate": ("new", "check", "candidates", "run", "study", "demo"),
     "See": ("report", "dash"),
     "Fleet": ("fleet",),
     "Live": ("live", "ros2", "keys", "doctor"),
@@ -162,7 +163,7 @@ OF_LAB = ("testbed", "validate")
 #: Commands that the help leaves out; `dwell live agent` and `dwell live controller` are in it.
 HIDDEN = ("agent", "controller", "schema")
 
-for command in (check, run, study, report, new, demo, doctor, completion):
+for command in (check, candidates, run, study, report, new, demo, doctor, completion):
     app.command()(command)
 app.command(hidden=True)(schema)
 app.add_typer(fleet, name="fleet")

@@ -121,7 +121,9 @@ def run(
             problem, realisation, policy=policy, estimator=estimator, jobs=jobs, guard=guard
         )
         counts = not result.windows["warmup"].all()
-        placements = other_placements(problem, realisation) if counts else {}
+        # A run that never moves is its own comparison.
+        known = {policy: result} if estimator is None and not guard else {}
+        placements = other_placements(problem, realisation, known=known) if counts else {}
         result = result.with_facts(**{PLACEMENTS: placements})
         try:
             result.save(folder)

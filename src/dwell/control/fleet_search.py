@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 from dwell.control.fleet_rank import FleetRank
 from dwell.control.knapsack import cheapest
-from dwell.control.neighbours import Neighbours, Rank, descend
+from dwell.control.neighbours import Neighbours, Rank
 from dwell.control.table_loads import Loads
 from dwell.estimators.fleet_prices import FleetPrice, FleetPrices
 
@@ -109,7 +109,7 @@ class FleetSearch:
         return self._play(placements, self._most)
 
     def _play(self, placements: Names, most: int) -> FleetPrice | None:
-        if not self._prices.knows(placements):
+        if placements not in self._prices.known:
             if self._plays >= most:
                 return None
             self._plays += 1
@@ -155,16 +155,14 @@ class FleetSearch:
             price = self._play(placements, most)
             return None if price is None else rank(price, sum(dues(placements)))
 
-        def neighbours(placements: Names) -> Iterator[Names]:
+        def aims(placements: Names) -> list[float]:
             aims = self._rank.aims(self._prices.price(placements))
-            played = [*map(add, aims, dues(placements))]
-            return self._neighbours.of(placements, costs, played)
+            return [*map(add, aims, dues(placements))]
 
-        starts = here, cheapest(self._loads, costs, here)
-        ranks = {one: found for one in starts if (found := ranked(one)) is not None}
-        if here not in ranks:
+        if ranked(here) is None:
             return here
-        return descend(min(ranks, key=ranks.__getitem__), neighbours, ranked)
+        starts = here, cheapest(self._loads, costs, here)
+        return self._neighbours.search(starts, costs, aims, ranked)
 
 
 def _costs(

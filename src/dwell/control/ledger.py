@@ -1,7 +1,7 @@
 """Ledger: the placements of a fleet's cells, and the moves that are good for all.
 
 The ledger considers the decisions of the cells one after another. The *presents* of the cells
-(their measured conditions, see `dwell.estimators.presents`) and the placements are constant from
+(their measured conditions, see `dwell.estimators.present`) and the placements are constant from
 one decision to the next. If anything has changed for a cell that may move, a table of loads
 proposes candidates, and the kernel simulates the fleet without and with the move on the same
 samples. The cell moves if
@@ -47,15 +47,10 @@ from dwell.control.watchdog import (
     Watchdog,
 )
 from dwell.cost import exceeds, excess, hamming
-from dwell.estimators.fleet_prices import (
-    CellPrice,
-    CellTerms,
-    FleetPrice,
-    FleetPrices,
-    PricedCell,
-)
+from dwell.estimators.cell_terms import CellTerms
+from dwell.estimators.fleet_prices import CellPrice, FleetPrice, FleetPrices, PricedCell
 from dwell.estimators.load_table import LoadTable, load_table
-from dwell.estimators.presents import Present
+from dwell.estimators.present import Present
 from dwell.estimators.prices import prices_of
 from dwell.estimators.protocol import CellEstimator
 from dwell.model import Caps, Decision, QoS

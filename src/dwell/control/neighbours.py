@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
@@ -109,6 +110,38 @@ class Neighbours:
         for turn in itertools.zip_longest(*kinds):
             yield from (found[1] for found in turn if found is not None)
 
+    def search(
+        self,
+        starts: Iterable[tuple[str, ...]],
+        costs: Sequence[Mapping[str, float]],
+        aims: Callable[[tuple[str, ...]], Sequence[float]],
+        rank: Callable[[tuple[str, ...]], Rank | None],
+    ) -> tuple[str, ...]:
+        """Search from the best start until no neighbour is better or `rank` returns None.
+
+        Parameters
+        ----------
+        costs
+            As in `of`.
+        aims : callable
+            Simulated cost of each cell at ranked placements.
+        rank : callable
+            Simulated rank of placements; None if no simulation is left.
+        """
+        best = min(starts, key=lambda one: rank(one) or (math.inf,))
+        least = rank(best)
+        while least is not None:
+            for one in self.of(best, costs, aims(best)):
+                found = rank(one)
+                if found is None:
+                    return best
+                if found < least:
+                    best, least = one, found
+                    break
+            else:
+                return best
+        return best
+
     def _moved(
         self,
         placements: Sequence[str],
@@ -140,27 +173,6 @@ class Neighbours:
         alone = loads.rise(at, other.cell, here, other.name)
         together = loads.rise(one.at, other.cell, here, other.name)
         return one.rise + other.rise + together - alone
-
-
-def descend(
-    start: tuple[str, ...],
-    neighbours: Callable[[tuple[str, ...]], Iterable[tuple[str, ...]]],
-    rank: Callable[[tuple[str, ...]], Rank | None],
-) -> tuple[str, ...]:
-    """Move to the first better neighbour until no neighbour is better or `rank` returns None."""
-    best, least = start, rank(start)
-    if least is None:
-        return best
-    while True:
-        for one in neighbours(best):
-            found = rank(one)
-            if found is None:
-                return best
-            if found < least:
-                best, least = one, found
-                break
-        else:
-            return best
 
 
 def _with(placements: Sequence[str], *moves: _Move) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from dwell.cost import price
-from dwell.estimators.fleet_prices import CellTerms
+from dwell.estimators.cell_terms import CellTerms
 from dwell.estimators.load_table import LoadTable
 
 

@@ -1,7 +1,7 @@
 """Prices of a complete fleet at given placements, simulated with the kernel.
 
 All cells are simulated together, each under its measured conditions (see
-`dwell.estimators.presents`). Realisations and phases are the same for all placements, so Φ depends
+`dwell.estimators.present`). Realisations and phases are the same for all placements, so Φ depends
 on the placements alone. A cell without tasks on a shared node does not affect other cells and is
 simulated once per candidate.
 """
@@ -15,11 +15,11 @@ from typing import TypeAlias
 
 import numpy as np
 
-from dwell.cost import price, tier_nodes
-from dwell.estimators.presents import Present, realised
+from dwell.estimators.candidate_player import CandidatePlayer
+from dwell.estimators.cell_terms import CellTerms
+from dwell.estimators.present import AS_DECLARED, Present
 from dwell.estimators.prices import SEED
-from dwell.kernels.advance import play
-from dwell.kernels.arrays import Arrays, lay_out
+from dwell.kernels.arrays import Arrays
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
@@ -34,7 +34,6 @@ Placements: TypeAlias = tuple[str | None, ...]
 #: Simulated cycles of all cells together; fewest windows of a cell, including the first, in which
 #: queues settle. Less than half a minute has too few bursts of foreign threads.
 CYCLES, FEWEST = 10_000, 9
-AS_DECLARED = Present()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +115,7 @@ class FleetPrices:
     ) -> None:
         self.cells, self.shared = tuple(cells), tuple(shared)
         self._windows = [_windows_of(cell.problem, cells, cycles) for cell in self.cells]
-        self._declared = [
+        drawn = [
             draw(
                 cell.problem,
                 scenario=cell.scenario,
@@ -128,9 +127,8 @@ class FleetPrices:
             )
             for cell, windows in zip(self.cells, self._windows, strict=True)
         ]
-        self._index = [
-            {name: i for i, name in enumerate(cell.problem.candidates)} for cell in cells
-        ]
+        problems = (cell.problem for cell in self.cells)
+        self._player = CandidatePlayer([*zip(problems, drawn, strict=True)], self.shared)
         self._meets = [
             {name: self.meets(placed) for name, placed in cell.problem.candidates.items()}
             for cell in self.cells
@@ -138,10 +136,9 @@ class FleetPrices:
         self._terms = [CellTerms(cell.problem, self.shared) for cell in self.cells]
         self._presents: list[Present] = [AS_DECLARED] * len(self.cells)
         self._absent: frozenset[int] = frozenset()
-        self._real = list(self._declared)
         self._alone: list[dict[str, CellPrice]] = [{} for _ in self.cells]
-        self._known: dict[Placements, FleetPrice] = {}
-        self._first: Arrays | None = None
+        #: Prices under the present conditions, by placements.
+        self.known: dict[Placements, FleetPrice] = {}
 
     def __repr__(self) -> str:
         return f"<FleetPrices: {len(self.cells)} cells, shared: {', '.join(self.shared)}>"
@@ -161,13 +158,15 @@ class FleetPrices:
         if not changed and self._absent == frozenset(absent):
             return
         self._presents, self._absent = list(presents), frozenset(absent)
-        # The first cell's realisation includes the conditions of shared nodes.
-        for i in dict.fromkeys((0, *changed)):
-            cell, declared = self.cells[i], self._declared[i]
-            self._real[i] = realised(cell.problem, declared, self._of(i))
+        # The first cell has the conditions of shared nodes.
+        new = {i: self._of(i) for i in (0, *changed)}
+        if not self._player.measures and any(of != AS_DECLARED for of in new.values()):
+            self._player = CandidatePlayer(self._player.cells, self.shared, measures=True)
+        if self._player.measures:
+            self._player.begin(new)
+        for i in new:
             self._alone[i].clear()
-        self._known.clear()
-        self._first = None
+        self.known.clear()
 
     def _of(self, index: int) -> Present:
         """Return a cell's measured conditions; the first cell's also describe shared nodes."""
@@ -185,16 +184,11 @@ class FleetPrices:
                     down.add(name)
         return replace(present, threads=FrozenDict(threads), down=frozenset(down))
 
-    def knows(self, placements: Placements) -> bool:
-        """Whether the price at some placements is known under these measured conditions."""
-        return placements in self._known
-
     def price(self, placements: Placements) -> FleetPrice:
         """Return the price at some placements; simulate it once per measured conditions."""
-        known = self._known.get(placements)
-        if known is None:
-            known = self._known[placements] = self._price(placements)
-        return known
+        if placements not in self.known:
+            self.known[placements] = self._price(placements)
+        return self.known[placements]
 
     def _price(self, placements: Placements) -> FleetPrice:
         placed = {i: name for i, name in enumerate(placements) if name is not None}
@@ -203,7 +197,7 @@ class FleetPrices:
         # The first cell on a shared node measures its utilisation; else, the first cell.
         watcher = min(there or placed)
         plays = {watcher, *there, *new}
-        arrays = self._played(placements, plays)
+        arrays = self._player.play({i: placed[i] for i in plays})
         found = {
             i: self._price_of(arrays, i) if i in plays else self._alone[i][name]
             for i, name in placed.items()
@@ -219,26 +213,12 @@ class FleetPrices:
         cells = tuple(map(found.get, range(len(placements))))
         return FleetPrice(cells, sum(costs) / len(costs), used)
 
-    def _played(self, placements: Placements, plays: Collection[int]) -> Arrays:
-        if self._first is None:
-            laid = zip((cell.problem for cell in self.cells), self._real, strict=True)
-            self._first = lay_out(list(laid), shared=self.shared).copy()
-        arrays = self._first.copy()
-        stamps = np.zeros_like(arrays.tables.stamps)
-        for i, name in enumerate(placements):
-            if name is not None:
-                stamps[i] = self._index[i][name]
-        arrays.replace(stamps=stamps)
-        arrays.leave_out(set(range(len(self.cells))).difference(plays))
-        play(arrays)
-        return arrays
-
     def _price_of(self, arrays: Arrays, i: int) -> CellPrice:
-        problem, terms = self.cells[i].problem, self._terms[i]
-        seen = arrays.tables.seen[i, 1 : self._windows[i]]
-        windows = np.column_stack((seen["l95_ms"], seen["missed"] / problem.window_cycles))
+        terms = self._terms[i]
+        played = self._player.windows(arrays, i, 1, self._windows[i])
+        windows = np.column_stack((played.l95_ms, played.violation_rate))
         l95_ms, rate = windows.mean(axis=0).tolist()
-        uncut_ms = float(seen["uncut_ms"].mean())
+        uncut_ms = float(played.uncut_ms.mean())
         shares = self._used(arrays, i).items()
         used = FrozenDict((name, share) for name, share in shares if name not in terms.of_shared)
         qos = QoS(l95_ms, rate, used, max(uncut_ms, l95_ms))
@@ -246,57 +226,8 @@ class FleetPrices:
 
     def _used(self, arrays: Arrays, i: int) -> dict[str, float]:
         """Return the utilisation of each resource by all cells, averaged over a cell's windows."""
-        resources = self._terms[i].resources
-        shares = arrays.tables.shares[i, 1 : self._windows[i], 0, : len(resources)].mean(axis=0)
-        return dict(zip(resources, shares.tolist(), strict=True))
-
-
-class CellTerms:
-    """Terms of a cell's J: its own terms, and the terms of shared nodes.
-
-    `resources` are all resources of the cell, `of_shared` the resources of shared nodes.
-    """
-
-    def __init__(self, problem: Problem, shared: Sequence[str]) -> None:
-        self.resources = tuple(problem.fabric.resources)
-        self._objective = objective = problem.objective
-        # J is linear in U_r, U_e and U_c.
-        factors: list[float] = [
-            price(0.0, 0.0, robot, edge, cloud, 0.0, objective)
-            for robot, edge, cloud in np.eye(3).tolist()
-        ]
-        self._capacity = {name: one.capacity for name, one in problem.fabric.resources.items()}
-        node_of = {name: one.node for name, one in problem.fabric.resources.items()}
-        self.of_shared = {name for name, node in node_of.items() if node in shared}
-        self._own, self._shared = [], []
-        for factor, names in zip(factors, tier_nodes(objective), strict=True):
-            self._own.append([name for name in names if name not in self.of_shared])
-            # The fullest resource of a shared node counts, accelerators included.
-            for node in shared:
-                here = [name for name in names if node_of[name] == node]
-                if here:
-                    self._shared.append((factor, here))
-
-    def cost(self, qos: QoS) -> float:
-        """J without switching and shared nodes."""
-        robot, edge, cloud = (_most(names, qos.utilisation) for names in self._own)
-        rate, objective = qos.violation_rate, self._objective
-        return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective))
-
-    def of_one(self) -> dict[str, float]:
-        """Return the cost to the cell of one busy core, or place, of each shared resource."""
-        return {
-            name: factor / self._capacity[name] for factor, names in self._shared for name in names
-        }
-
-    def shared_cost(self, used: Mapping[str, float]) -> float:
-        """Return the cost to the cell of the utilisation of shared nodes."""
-        return sum(factor * _most(names, used) for factor, names in self._shared)
-
-
-def _most(names: Sequence[str], used: Mapping[str, float]) -> float:
-    """Return the utilisation of the fullest resource; unknown resources count as 0."""
-    return max((used.get(name, 0.0) for name in names), default=0.0)
+        shares = self._player.windows(arrays, i, 1, self._windows[i]).shares[:, 0].mean(axis=0)
+        return dict(zip(self._terms[i].resources, shares.tolist(), strict=True))
 
 
 def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> int:

@@ -80,7 +80,7 @@ class Learning(Online):
         self._doubts: dict[str, int] = {}
         self._pools = {
             part: Pool(reference, isinstance(part, Message))
-            for part, reference in self._playing.declared.references.items()
+            for part, reference in self._player.declared.references.items()
         }
         groups = list(map(self._meter.numbers, self._parts.values()))
         padded = np.full((len(groups), max(map(len, groups))), -1)
@@ -242,7 +242,7 @@ class Learning(Online):
             share_error(share, max(pool.measured, 1)) for pool in measured if (share := pool.lost)
         ]
         if lost:
-            l95_ms = math.hypot(l95_ms, self._playing.tail_error_ms(name, math.hypot(*lost)))
-        widened = max(map(self._widening, measured)) * self._playing.played(name).l95_ms
+            l95_ms = math.hypot(l95_ms, self._player.tail_error_ms(name, math.hypot(*lost)))
+        widened = max(map(self._widening, measured)) * self._player.played(name).l95_ms
         count = max(min(pool.measured for pool in measured), 1)
         return math.hypot(l95_ms, widened), unseen_error(rate, count)

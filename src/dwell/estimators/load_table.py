@@ -17,6 +17,7 @@ import numpy as np
 
 from dwell.estimators.fleet_prices import FleetPrices, PricedCell
 from dwell.estimators.prices import prices_of
+from dwell.estimators.remembered import Remembered
 from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.progress import Progress
@@ -138,7 +139,7 @@ def _controlled(
     return np.maximum(rest.mean(axis=0) + slope * known, 0.0), np.sqrt(variance)
 
 
-_known: dict[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable] = {}
+_remembered = Remembered[tuple[tuple[PricedCell, ...], tuple[str, ...]], LoadTable](KEPT)
 
 
 def load_table(
@@ -148,11 +149,7 @@ def load_table(
 ) -> LoadTable:
     """Return the table of a fleet; known tables are not simulated again."""
     asked = tuple(cells), tuple(shared)
-    if asked not in _known:
-        _known[asked] = LoadTable(*asked, progress=progress)
-        for old in list(_known)[:-KEPT]:
-            del _known[old]
-    return _known[asked]
+    return _remembered.answer(asked, lambda: LoadTable(*asked, progress=progress))
 
 
 def kinds_of(cells: Sequence[PricedCell]) -> tuple[int, ...]:

@@ -3,8 +3,8 @@
 They keep the measured conditions (`Present`): demands of every part of a cycle, foreign threads of
 every node, rates of links, and nodes that are down. Conditions are as declared until evidence shows
 a change. An unaffected candidate has its price from the profile. The kernel simulates the others
-(see `Playing`): several steps after a change, one more step for new samples, and further steps for
-candidates on which the next move may depend.
+(see `StepwisePlayer`): several steps after a change, one more step for new samples, and further
+steps for candidates on which the next move may depend.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from functools import partial
-from typing import NamedTuple
 
 from dwell.cost import cost_error, hamming
+from dwell.estimators.cell_terms import CellTerms
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.fleet_prices import CellTerms
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
 from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
-from dwell.estimators.presents import Playing, Present
+from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.spans import patience_ns
+from dwell.estimators.stepwise_player import StepwisePlayer
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
-from dwell.model.qos import QoS, unchecked_qos
+from dwell.model.qos import NO_ERROR, QoS, unchecked_qos
 from dwell.model.shadow_plan import by_candidate
 
 #: Simulated steps after a change of conditions; the first fills the queues.
@@ -38,14 +38,6 @@ FIRST_STEPS = 6
 ROUNDS, STEPS = 2, 2
 #: A decision is sure if a price difference is this many standard errors from its thresholds.
 BAND = 2.0
-
-
-class _Declared(NamedTuple):
-    """Work and metrics of a candidate under declared conditions, in the form of `unchecked_qos`."""
-
-    work: list[tuple[str, float]]
-    latency: tuple[float, float]
-    others: tuple[float | None, tuple[float, float] | None]
 
 
 class Online(CellEstimator):
@@ -59,7 +51,7 @@ class Online(CellEstimator):
         self.profile, self._terms = Profile(problem), CellTerms(problem, ())
         self._regimes = 0
         self._meter, self._stretches = Meter(problem), Stretches(problem)
-        self._playing = Playing(problem, self.seed, self.shadow_fraction)
+        self._player = StepwisePlayer(problem, self.seed, self.shadow_fraction)
         self._parts = {
             name: tuple(dict.fromkeys(parts_of(problem.pipeline, placed)))
             for name, placed in problem.candidates.items()
@@ -78,8 +70,8 @@ class Online(CellEstimator):
         self._plays = False
         self._patience_ns = patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
-        #: Constant parts of the estimates, cached at the first estimate.
-        self._declared: dict[str, _Declared] = {}
+        #: Price and work of each candidate as declared, cached at the first estimate.
+        self._declared: dict[str, tuple[QoS, list[tuple[str, float]]]] = {}
         #: The last window until `estimate` uses it, and until its demands are learnt.
         self._evidence: Evidence | None = None
         self._pending: Evidence | None = None
@@ -182,7 +174,7 @@ class Online(CellEstimator):
                 unsure = self._unsure(names, estimates, incumbent)
                 if not unsure:
                     break
-                self._playing.go_on(self._playing.present, unsure, STEPS)
+                self._player.go_on(self._player.present, unsure, STEPS)
                 estimates = self._priced(names, foreign)
         for name in names:
             one, error = estimates[name], self._stated_error(name)
@@ -192,44 +184,33 @@ class Online(CellEstimator):
 
     def _stated_error(self, name: str) -> tuple[float, float]:
         """Return standard errors of L95 (ms) and V_D due to simulated and measured samples."""
-        played = self._playing.played(name)
+        played = self._player.played(name)
         known = self._known_error(name, played.violation_rate)
-        return (
-            math.hypot(played.l95_error_ms, known[0]),
-            math.hypot(played.violation_error, known[1]),
-        )
+        l95_error_ms, violation_error = played.error or NO_ERROR
+        return math.hypot(l95_error_ms, known[0]), math.hypot(violation_error, known[1])
 
     def deviations(self, name: str) -> tuple[float, float]:
         """Return standard deviations of one window under a candidate (see `CellEstimator`)."""
-        return self._playing.deviations(name)
+        return self._player.deviations(name)
 
     def _priced(self, names: list[str], foreign: Foreign) -> dict[str, QoS]:
-        """Return the metrics of all candidates, without errors if simulated."""
-        played = {name: self._playing.played(name) for name in names}
+        """Return the metrics of all candidates; some of them are simulated."""
         if not self._declared:
-            self._declared = {name: self._as_declared(name) for name in self.problem.candidates}
-        work = [
-            (name, self._with_sent(name, played[name].own) if name in played else one.work)
-            for name, one in self._declared.items()
-        ]
-        shares = self.profile.with_work(foreign, work)
-        estimates = {}
-        for name, one in self._declared.items():
-            if name not in played:
-                estimates[name] = unchecked_qos(*one.latency, shares[name], *one.others)
-                continue
-            one_played = played[name]
-            l95_ms, uncut_ms = one_played.l95_ms, one_played.uncut_l95_ms
-            cut_from_ms = None if uncut_ms == l95_ms else uncut_ms
-            metrics = l95_ms, one_played.violation_rate, shares[name], cut_from_ms
-            estimates[name] = unchecked_qos(*metrics)
-        return estimates
-
-    def _as_declared(self, name: str) -> _Declared:
-        """Return the constant parts of a candidate's estimate under declared conditions."""
-        qos, work = self._playing.prices[name].qos, self._playing.prices[name].own
-        latency, others = (qos.l95_ms, qos.violation_rate), (qos.cut_from_ms, qos.error)
-        return _Declared(self._with_sent(name, work), latency, others)
+            self._declared = {
+                name: (price.qos, self._with_sent(name, price.own))
+                for name, price in self._player.prices.items()
+            }
+        priced = dict(self._declared)
+        for name in names:
+            qos = self._player.played(name)
+            priced[name] = qos, self._with_sent(name, qos.utilisation)
+        shares = self.profile.with_work(foreign, ((name, priced[name][1]) for name in priced))
+        return {
+            name: unchecked_qos(
+                qos.l95_ms, qos.violation_rate, shares[name], qos.cut_from_ms, qos.error
+            )
+            for name, (qos, _) in priced.items()
+        }
 
     def _with_sent(self, name: str, work: Mapping[str, float]) -> list[tuple[str, float]]:
         """Add the share of each resource that shadow jobs take to the cell's own work."""
@@ -246,7 +227,7 @@ class Online(CellEstimator):
         problem, least = self.problem, self.problem.controller.min_improvement
         objective, here = problem.objective, problem.candidates[incumbent]
         errors = {name: self._sampled(name) for name in names}
-        can_go_on = {name for name in names if errors[name] and not self._playing.is_full(name)}
+        can_go_on = {name for name in names if errors[name] and not self._player.is_full(name)}
         if not can_go_on:
             return []
         unsure, cost = set(), self._terms.cost(estimates[incumbent])
@@ -262,15 +243,14 @@ class Online(CellEstimator):
 
     def _sampled(self, name: str) -> float:
         """Return the standard error of a candidate's J due to few simulated cycles."""
-        played = self._playing.played(name)
-        error = (played.l95_error_ms, played.violation_error)
+        error = self._player.played(name).error or NO_ERROR
         return cost_error(error, self.problem.objective)
 
     def _look_at_nodes(
         self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
     ) -> None:
         """Update the foreign threads of nodes, and the nodes that are down, from a window."""
-        known = self._playing.prices[incumbent]
+        known = self._player.prices[incumbent]
         for name, foreign in self._foreign.items():
             usual, deviation = known.foreign[name], known.foreign_deviation[name]
             level = partial(self._stretches.level, evidence, name)
@@ -332,10 +312,10 @@ class Online(CellEstimator):
         present = self._present(otherwise)
         self._count_presents()
         if self._has_changed:
-            self._playing.begin(present)
-            self._playing.go_on(present, names, FIRST_STEPS)
+            self._player.begin(present)
+            self._player.go_on(present, names, FIRST_STEPS)
         elif self._has_grown:
-            self._playing.go_on(present, names, has_grown=True)
+            self._player.go_on(present, names, has_grown=True)
         self._has_changed = self._has_grown = False
 
     def _count_presents(self) -> None:

@@ -13,19 +13,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.sent_shadows import SentShadows, hindered, stamps_of
+from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
+from dwell.estimators.remembered import Remembered
+from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
-from dwell.kernels.advance import play
-from dwell.kernels.arrays import lay_out
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.random_draws import Drawing
-from dwell.kernels.realisation import Realisation
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.instants import NEVER_NS, longest_run
@@ -166,7 +165,8 @@ class Question:
         )
 
 
-_known: dict[Question, Mapping[str, Price]] = {}
+#: Known prices of this process; another process can take them over.
+KNOWN_PRICES = Remembered[Question, Mapping[str, Price]](KEPT)
 
 
 def prices_of(
@@ -184,31 +184,11 @@ def prices_of(
     this share by candidate. Raise `KernelError` if the compiled kernel cannot be loaded.
     """
     question = Question.of(problem, scenario, seed, cycles, shadow_fraction)
-    known = _known.get(question)
-    if known is None:
-        known = _answer(question)
-        take_over({question: known})
-    return known
-
-
-def known_prices() -> dict[Question, Mapping[str, Price]]:
-    """Return the known prices of this process, which another process can `take_over`."""
-    return dict(_known)
-
-
-def take_over(known: Mapping[Question, Mapping[str, Price]]) -> None:
-    """Add known prices; drop the oldest beyond `KEPT`."""
-    _known.update(known)
-    for question in list(_known)[:-KEPT]:
-        del _known[question]
+    return KNOWN_PRICES.answer(question, lambda: _answer(question))
 
 
 def _answer(question: Question) -> Mapping[str, Price]:
-    problem = question.problem
-    if problem.window_cycles > LONGEST_WINDOW:
-        every = min(problem.decide_cycles, LONGEST_WINDOW)
-        controller = replace(problem.controller, decide_cycles=every)
-        problem = replace(problem, window_cycles=LONGEST_WINDOW, controller=controller)
+    problem = with_windows_up_to(LONGEST_WINDOW, question.problem)
     most = most_windows(problem, question.cycles)
     slow = slow_processes(problem, question.name)
     loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
@@ -232,10 +212,8 @@ def _answer(question: Question) -> Mapping[str, Price]:
         shadows = None
         if question.shadow_fractions:
             shadows = SentShadows(problem, realisation, question.shadow_fractions)
-        is_last = windows == most
-        found |= {
-            name: price_of(problem, realisation, name, shadows, is_last=is_last) for name in left
-        }
+        player = CandidatePlayer([(problem, realisation)], shadows=shadows, decides=True)
+        found |= {name: price_of(player, name, is_last=windows == most) for name in left}
         if windows >= least:
             left = [name for name in left if not found[name].is_good_enough]
         if not left or windows == most:
@@ -272,33 +250,21 @@ def most_windows(problem: Problem, cycles: int | None = None) -> int:
     return max(min(most, longest_run(pipeline.period_ms) // width), 1)
 
 
-def price_of(
-    problem: Problem,
-    realisation: Realisation,
-    name: str,
-    shadows: SentShadows | None = None,
-    *,
-    is_last: bool = True,
-) -> Price:
-    """Price a candidate by its windows in one realisation.
+def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Price:
+    """Price a candidate by its windows in the realisation of a single cell.
 
     If `is_last`, the simulation cannot grow any more, and errors include slow processes.
     """
-    sent = shadows.realisation if shadows else None
-    arrays = lay_out([(problem, realisation)], shadows=[sent], decides=True)
-    index = list(problem.candidates).index(name)
-    arrays.replace(stamps=stamps_of(arrays, index, shadows))
-    play(arrays)
-    tables = arrays.tables  # read after `play`: a table that grows is replaced
-    first = min(SETTLING, realisation.windows - 1)
-    seen = tables.seen[0, first:]
+    ((problem, realisation),) = player.cells
+    arrays, first = player.play({0: name}), min(SETTLING, realisation.windows - 1)
+    windows, tables = player.windows(arrays, 0, first), arrays.tables
     slow = slow_processes(problem, realisation.scenario)
-    windows_ms, rates = seen["l95_ms"], seen["missed"] / problem.window_cycles
+    windows_ms, rates = windows.l95_ms, windows.violation_rate
     l95_ms, violation_rate = float(windows_ms.mean()), float(rates.mean())
     (_, l95_error_ms), (_, violation_error) = mean_and_error(windows_ms), mean_and_error(rates)
     if l95_error_ms and not violation_error:
         # Windows are random, but all miss the same number of deadlines: usually none, or all.
-        violation_error = unseen_error(violation_rate, len(seen) * problem.window_cycles)
+        violation_error = unseen_error(violation_rate, len(rates) * problem.window_cycles)
     if is_last:
         l95_error_ms, violation_error = slow.errors(
             problem, realisation, name, windows_ms, rates, (l95_error_ms, violation_error)
@@ -312,12 +278,11 @@ def price_of(
     age_ms = (realisation.release_ns[-1] - realisation.release_ns[since:-1]) / 1e6
     is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
     lost = int(np.count_nonzero(~done & ~is_young))
-    uncut_ms, is_lost = _known_later(latency_ns.reshape(len(seen), -1), windows_ms)
-    open_windows = is_young.reshape(len(seen), -1).any(axis=1)
+    uncut_ms, is_lost = _known_later(latency_ns.reshape(len(rates), -1), windows_ms)
+    open_windows = is_young.reshape(len(rates), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
-    _, own, _, _ = np.moveaxis(tables.shares[0, first:], 1, 0)
-    foreign = _foreign(tables.shares[0, first:])
+    own, foreign = windows.shares[:, 1], _foreign(windows.shares)
     stretches = foreign
     if len(looks := tables.look_shares[0, since // problem.decide_cycles :, 0]):
         stretches = _foreign(looks)

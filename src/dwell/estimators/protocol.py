@@ -12,7 +12,7 @@ from dwell.model.qos import QoS
 from dwell.model.shadow_plan import ShadowFraction
 
 if TYPE_CHECKING:
-    from dwell.estimators.presents import Present
+    from dwell.estimators.present import Present
 
 
 class Support(NamedTuple):

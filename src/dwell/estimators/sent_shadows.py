@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators.measured import Message, message_of, parts_of, sending_ns
-from dwell.kernels.arrays import Arrays
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import Realisation
 from dwell.model.placement import Placement
@@ -48,14 +47,6 @@ class SentShadows:
         if not self._hindered[index]:
             return -1
         return self._plan.stamps(0, self.realisation.cycles, index)
-
-
-def stamps_of(arrays: Arrays, index: int, shadows: SentShadows | None) -> NDArray[np.int16]:
-    """Return the stamps of tables if every cycle runs under one candidate."""
-    stamps = np.full_like(arrays.tables.stamps, index)
-    if shadows is not None:
-        stamps[1] = shadows.stamps(index)
-    return stamps
 
 
 @lru_cache(maxsize=64)

@@ -116,6 +116,20 @@ class Arrays:
             row = self.tables._fields.index(name)
             self._addresses[row] = table.ctypes.data, table.size
 
+    def on(self, candidates: Mapping[int, int | NDArray[np.int16]]) -> Arrays:
+        """Return a copy in which cells stay on a candidate, by row; other cells are left out.
+
+        The row of a shadow has the stamps of its cycles in place of a candidate.
+        """
+        arrays = self.copy()
+        stamps = np.zeros_like(self.tables.stamps)
+        for row, candidate in candidates.items():
+            stamps[row] = candidate
+        arrays.replace(stamps=stamps)
+        if others := set(range(len(stamps))).difference(candidates):
+            arrays.leave_out(others)
+        return arrays
+
     def leave_out(self, rows: Collection[int]) -> None:
         """Leave some cells out of the simulation: they release no cycles and have no windows."""
         cells, clock, events = self.tables.cells, self.tables.clock[0], self.tables.events

@@ -248,7 +248,7 @@ class TimesRow(NamedTuple):
 def fill(
     rows: Sequence[TimesRow], values: Floats, stretched: float, begin: int, offset: int
 ) -> None:
-    """Fill the times of cycles with known values in turn (see `dwell.estimators.presents`).
+    """Fill the times of cycles with known values in turn (see `dwell.estimators.present_tables`).
 
     Parameters
     ----------

@@ -264,6 +264,8 @@ class Drawing:
         Prefix of the names of the streams.
     shared, disturbances
         As in `draw`.
+    every_hop : bool
+        Whether to sample all hops that any placement can use, and not only those of candidates.
 
     Raises
     ------
@@ -283,6 +285,7 @@ class Drawing:
         streams: str = "",
         shared: Collection[str] = (),
         disturbances: Scenario = (),
+        every_hop: bool = False,
     ) -> None:
         self.problem, self.name, self.shared = problem, scenario, shared
         own = (item for item in problem.scenario(scenario) if not self._is_shared(item))
@@ -295,7 +298,7 @@ class Drawing:
         self.sent: Ints | None = None
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
-        self.hops = _hops(problem)
+        self.hops = tuple(_possible_hops(problem)) if every_hop else _hops(problem)
         self.paths: dict[str, Path] = {}
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
@@ -635,6 +638,15 @@ def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
                 hops[flow.source, flow.target, link] = None
     # Always add the hops of states: cold and warm migrations then have the same realisation.
     return (*hops, *_state_hops(problem))
+
+
+def _possible_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
+    """Yield flows with the links that they can use in any placement, by flow, then by link."""
+    tasks = problem.pipeline.tasks
+    for flow in problem.pipeline.flows:
+        for link in problem.fabric.links.values():
+            if link.source in tasks[flow.source].on and link.target in tasks[flow.target].on:
+                yield flow.source, flow.target, link.name
 
 
 def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:

@@ -8,7 +8,7 @@ as long as the simulated Φ improves. Small fleets repeat it from placements nea
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,9 +16,10 @@ import numpy as np
 
 from dwell.control.fleet_rank import FleetRank, fleet_rank
 from dwell.control.knapsack import cheapest
-from dwell.control.neighbours import Neighbours, Rank, descend
+from dwell.control.neighbours import Neighbours, Rank
 from dwell.control.table_loads import Loads
-from dwell.estimators.fleet_prices import CellTerms, FleetPrice, FleetPrices
+from dwell.estimators.cell_terms import CellTerms
+from dwell.estimators.fleet_prices import FleetPrice, FleetPrices
 from dwell.estimators.load_table import load_table
 from dwell.estimators.prices import SEED, prices_of
 from dwell.model.fleet import Fleet
@@ -154,23 +155,22 @@ def _as_played(
     alone: Sequence[Mapping[str, float]],
     starts: Sequence[tuple[str, ...]],
 ) -> tuple[str, ...]:
-    """Search from the best start, and return the best simulated placements."""
-    played: dict[tuple[str, ...], FleetPrice] = {}
-    most = max(CELLS_PLAYED // len(alone), 1)
+    """Search from the best start, and return the best simulated placements.
+
+    `prices` must have no known prices: they count as simulations of this search.
+    """
+    most, played = max(CELLS_PLAYED // len(alone), 1), prices.known
 
     def ranked(placements: tuple[str, ...]) -> Rank | None:
-        if placements not in played:
-            if len(played) >= most:
-                return None
-            played[placements] = prices.price(placements)
-        return rank.of(played[placements])
+        if placements not in played and len(played) >= most:
+            return None
+        return rank.of(prices.price(placements))
+
+    def aims(placements: tuple[str, ...]) -> list[float]:
+        return rank.aims(prices.price(placements))
 
     near = Neighbours(prices.cells, loads)
-
-    def neighbours(placements: tuple[str, ...]) -> Iterable[tuple[str, ...]]:
-        return near.of(placements, alone, rank.aims(played[placements]))
-
-    best = descend(min(starts, key=lambda one: ranked(one) or (math.inf,)), neighbours, ranked)
+    best = near.search(starts, alone, aims, ranked)
     rng = np.random.Generator(np.random.SFC64(SEED))
     for _ in range(ENOUGH_PLAYS):
         if len(played) >= min(ENOUGH_PLAYS, most):
@@ -178,8 +178,8 @@ def _as_played(
         start = list(best)
         for i in rng.permutation(len(start))[:ELSEWHERE].tolist():
             start[i] = list(alone[i])[int(rng.integers(len(alone[i])))]
-        descend(tuple(start), neighbours, ranked)
-        best = min(played, key=lambda one: ranked(one) or ())
+        found = near.search([tuple(start)], alone, aims, ranked)
+        best = min(best, found, key=lambda one: ranked(one) or (math.inf,))
     return best
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import islice
 
-from dwell.model import Problem
+from dwell.model import FrozenDict, Problem
+from dwell.record import Run
 from dwell.sim import Realisation, simulate_realisation
 from dwell.study.summary import answer_of
 
@@ -15,9 +17,17 @@ PLACEMENTS = "placements"
 
 
 def other_placements(
-    problem: Problem, realisation: Realisation, most: int = MOST
+    problem: Problem,
+    realisation: Realisation,
+    most: int = MOST,
+    known: Mapping[str, Run] = FrozenDict(),
 ) -> dict[str, dict[str, float]]:
     """Simulate placements that never move.
+
+    Parameters
+    ----------
+    known : mapping of str to Run
+        Runs that are not simulated again, by candidate.
 
     Returns
     -------
@@ -31,7 +41,8 @@ def other_placements(
     """
     first = problem.initial
     names = (first, *(name for name in problem.candidates if name != first))
-    return {
-        name: answer_of(simulate_realisation(problem, realisation, policy=name), problem)
-        for name in islice(names, most)
-    }
+
+    def run(name: str) -> Run:
+        return known.get(name) or simulate_realisation(problem, realisation, policy=name)
+
+    return {name: answer_of(run(name), problem) for name in islice(names, most)}

@@ -13,7 +13,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 from dwell.errors import SimulationError
-from dwell.estimators.prices import Price, Question, known_prices, take_over
+from dwell.estimators.prices import KNOWN_PRICES, Price, Question
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.study.hindsight import Hindsight
@@ -154,7 +154,7 @@ class Player:
             raise SimulationError(
                 f"a worker has other software than the process that asks it: {has}, not {needs}"
             )
-        take_over(self.prices)
+        KNOWN_PRICES.add(self.prices)
         summaries: dict[str, list[tuple[int, Summary]]] = {name: [] for name in batch.players}
         examples: dict[tuple[Item, int, str], Example] = {}
         until, done = time.monotonic() + BATCH_S, 0
@@ -193,7 +193,7 @@ class Player:
             )
             for contender in contenders:
                 self._simulate(contender, index, realisation, alone)
-        self.prices.update(known_prices())
+        self.prices.update(KNOWN_PRICES.known)
 
     def _play(
         self, item: Item, players: Sequence[str]

@@ -1,0 +1,84 @@
+"""Simulation of any placement of a cell, named or not, on common samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from dwell.estimators.slow_processes import mean_and_error
+from dwell.kernels.advance import play
+from dwell.kernels.arrays import lay_out, ordered_flows
+from dwell.kernels.random_draws import Drawing
+from dwell.kernels.realisation import Realisation
+from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats
+from dwell.model.problem import Problem
+from dwell.model.qos import QoS
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Metrics of a placement, by window, and its mean use of each resource."""
+
+    l95_ms: Floats
+    violation_rate: Floats
+    utilisation: Mapping[str, float]
+
+    @property
+    def qos(self) -> QoS:
+        """Means over the windows; their standard errors if there is more than one window."""
+        (l95_ms, l95_error), (rate, rate_error) = map(
+            mean_and_error, (self.l95_ms, self.violation_rate)
+        )
+        error = (l95_error, rate_error) if len(self.l95_ms) > 1 else None
+        return QoS(l95_ms, rate, self.utilisation, error=error)
+
+
+class AnyPlacement:
+    """One sample of a scenario on which every placement can be simulated.
+
+    Attributes
+    ----------
+    problem : Problem
+        The cell with the window of the sample.
+    realisation : Realisation
+        With every hop that any placement can use.
+    """
+
+    def __init__(self, problem: Problem, scenario: str, *, seed: int, windows: int) -> None:
+        self.problem = problem
+        drawing = Drawing(problem, scenario, seed=seed, windows=windows, wraps=True, every_hop=True)
+        self.realisation: Realisation = drawing.take(windows)
+        self._first = lay_out([(problem, self.realisation)]).copy()
+        self._arrays = self._first.copy()
+        self._sites = {site: row for row, site in enumerate(self.realisation.sites)}
+        self._hops = {hop: row for row, hop in enumerate(self.realisation.hops)}
+        self._flows = ordered_flows(problem.pipeline)
+        tables = self._arrays.tables
+        self._site_of, self._route = tables.site_of[:1].copy(), tables.route[:1].copy()
+        # The placement replaces the first candidate, which all cycles use.
+        self._arrays.replace(
+            site_of=self._site_of, route=self._route, stamps=np.zeros_like(tables.stamps)
+        )
+
+    def measure(self, placement: Mapping[str, str]) -> Measured:
+        """Simulate a placement of all tasks, whose flows have links."""
+        arrays = self._arrays
+        arrays.restart(self._first)
+        self._site_of[0] = [
+            self._sites[task, placement[task]] for task in self.problem.pipeline.tasks
+        ]
+        for column, flow in enumerate(self._flows):
+            link = f"{placement[flow.source]}->{placement[flow.target]}"
+            self._route[0, column] = self._hops.get((flow.source, flow.target, link), -1)
+        play(arrays)
+        tables = arrays.tables  # read after `play`: a table that grows is replaced
+        seen, used = tables.seen[0], tables.shares[0, :, 0].mean(axis=0)
+        resources = self.problem.fabric.resources
+        return Measured(
+            l95_ms=seen["l95_ms"].copy(),
+            violation_rate=seen["missed"] / self.problem.window_cycles,
+            utilisation=FrozenDict(zip(resources, used.round(12).tolist(), strict=True)),
+        )

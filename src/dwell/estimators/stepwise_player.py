@@ -1,0 +1,277 @@
+"""Stepwise player: simulates candidates of a cell under measured conditions, step by step.
+
+All candidates have the same realisation. Each simulation continues where it stopped, and its newest
+steps are averaged until the conditions change.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
+from dwell.estimators.declared_cell import LONGEST_WINDOW, STEP, declared_of
+from dwell.estimators.present import Present
+from dwell.estimators.prices import SEED, prices_of
+from dwell.estimators.slow_processes import unseen_error
+from dwell.kernels.advance import play
+from dwell.kernels.arrays import Arrays
+from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
+from dwell.model.frozen import FrozenDict
+from dwell.model.number_arrays import Floats, Ints
+from dwell.model.problem import Problem
+from dwell.model.qos import QoS, unchecked_qos
+from dwell.model.shadow_plan import ShadowFraction
+
+#: Most steps in a candidate's price; the same while the measured demands change.
+KEPT, RECENT = 24, 6
+#: Limit of the correlation of successive steps; more would be a drift.
+MOST_ALIKE = 0.9
+
+
+class _Twin:
+    """The simulation of a candidate, and the results of its steps."""
+
+    def __init__(self, arrays: Arrays, resources: int) -> None:
+        self.arrays = arrays
+        #: Next cycle to simulate.
+        self.cursor = 0
+        #: Means of each step, oldest first: L95 (ms) and V_D, each followed by the mean of the same
+        #: windows as declared; uncut L95; the cell's own share of every resource.
+        self.steps = Steps(KEPT, PAIRS + 1 + resources)
+        #: Latencies of the cycles of each step.
+        self.latency_ns: deque[Ints] = deque(maxlen=KEPT)
+        self.price: QoS | None = None
+
+    def add(self, means: Sequence[float], latency_ns: Ints) -> None:
+        """Add a step; drop the oldest beyond `KEPT`."""
+        self.steps.add(means)
+        self.latency_ns.append(latency_ns)
+
+    def keep(self, most: int) -> None:
+        """Keep the newest `most` steps."""
+        self.steps.keep(most)
+        while len(self.latency_ns) > most:
+            self.latency_ns.popleft()
+
+
+class StepwisePlayer:
+    """Simulates the candidates of a problem under measured conditions.
+
+    `seed` is the seed of the declared realisation; `shadow_fraction` is the share of cycles that
+    are also sent through each alternative, by simulated candidate. `prices` are the prices as
+    declared; `cycles` counts the simulated cycles of all candidates.
+    """
+
+    def __init__(
+        self, problem: Problem, seed: int = SEED, shadow_fraction: ShadowFraction = 0.0
+    ) -> None:
+        self.problem, self._seed, self._shadow_fraction = problem, seed, shadow_fraction
+        self.declared = declared_of(problem, seed, shadow_fraction)
+        self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
+        self._window = min(problem.window_cycles, LONGEST_WINDOW)
+        self._names, self._resources = tuple(problem.candidates), tuple(problem.fabric.resources)
+        self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
+        #: Standard deviations of a step's L95 (ms) and V_D, as declared.
+        self._usual = {
+            name: [
+                float(windows[name][1:].std()) / math.sqrt(self._step)
+                for windows in (self.declared.l95_ms, self.declared.violation_rate)
+            ]
+            for name in self._names
+        }
+        self.cycles = 0
+        self._player = CandidatePlayer(
+            [(with_windows_up_to(LONGEST_WINDOW, problem), self.declared.realisation)],
+            shadows=self.declared.shadows,
+            measures=True,
+        )
+        self._twins: dict[str, _Twin] = {}
+
+    def __reduce__(self) -> tuple[type[StepwisePlayer], tuple[Problem, int, ShadowFraction]]:
+        # The kernel's tables have addresses; a copy starts without simulations.
+        return StepwisePlayer, (self.problem, self._seed, self._shadow_fraction)
+
+    def begin(self, present: Present) -> None:
+        """Begin with other measured conditions; discard the results of earlier steps."""
+        self.present, self._offset = present, 0
+        first = self._player.begin({0: present})
+        if not self._twins:
+            first.tables.clock[0]["pauses"] = 1
+            self._twins = {
+                name: _Twin(self._player.tables({0: name}), len(self._resources))
+                for name in self._names
+            }
+        for twin in self._twins.values():
+            twin.keep(0)
+            twin.arrays.replace(changes=first.tables.changes)
+        self._restart()
+
+    def go_on(
+        self, present: Present, names: Collection[str], steps: int = 1, *, has_grown: bool = False
+    ) -> None:
+        """Simulate more steps of some candidates; the measured conditions have the same parts.
+
+        If `has_grown`, the parts have newer values, and prices use only the most recent steps.
+        """
+        self.present = present
+        if has_grown:
+            since = max(twin.cursor for twin in self._twins.values())
+            self._player.grow(present, since, self._offset)
+            for name in names:
+                self._twins[name].keep(RECENT - 1)
+        for _ in range(steps):
+            last = max(self._twins[name].cursor for name in names)
+            cycles = self.declared.realisation.cycles
+            if last + self._step * self._window > cycles:
+                self._offset += cycles
+                self._player.grow(present, 0, self._offset)
+                self._restart()
+            for name in names:
+                self._play(self._twins[name], name)
+
+    def _restart(self) -> None:
+        for twin in self._twins.values():
+            twin.arrays.restart(self._player.first)
+            twin.cursor = 0
+
+    def _play(self, twin: _Twin, name: str) -> None:
+        first = twin.cursor // self._window
+        last = first + self._step
+        twin.cursor += self._step * self._window
+        for _ in range(self._step):
+            play(twin.arrays)
+        first = max(first, 1)  # in the first window queues have not settled
+        if first < last:
+            windows = self._player.windows(twin.arrays, 0, first, last)
+            means = (
+                _mean(windows.l95_ms),
+                _mean(self.declared.l95_ms[name][first:last]),
+                _mean(windows.missed) / self._window,
+                _mean(self.declared.violation_rate[name][first:last]),
+                _mean(windows.uncut_ms),
+                *_mean_shares(windows.shares[:, 1]),
+            )
+            latency_ns = twin.arrays.tables.latency_ns[0, first * self._window : twin.cursor]
+            twin.add(means, latency_ns.copy())
+        twin.price = None
+        self.cycles += self._step * self._window
+
+    def played(self, name: str) -> QoS:
+        """Return the means of a candidate with errors; the utilisation is the cell's own."""
+        twin = self._twins[name]
+        if twin.price is None:
+            twin.price = self._price(name, twin.steps)
+        return twin.price
+
+    def deviations(self, name: str) -> tuple[float, float]:
+        """Return the standard deviations of one window's L95, milliseconds, and V_D."""
+        price = self.prices[name]
+        usual = price.l95_deviation_ms, price.violation_deviation
+        if not self._twins or len(steps := self._twins[name].steps) < 2:
+            return usual
+        shown = np.ascontiguousarray(steps.table[:, :PAIRS:2])
+        # A deviation from few values is itself uncertain.
+        few = (len(steps) + 1) / (len(steps) - 1) * math.sqrt(self._step)
+        l95_ms, rate = (few * shown.std(axis=0)).tolist()
+        return max(l95_ms, usual[0]), max(rate, usual[1])
+
+    def tail_error_ms(self, name: str, off: float) -> float:
+        """Return the error of L95 (ms) that an error `off` of the share of lost cycles causes."""
+        latency_ns = np.concatenate(self._twins[name].latency_ns)
+        return tail_error_ms(latency_ns, self._censor_ms, off)
+
+    def _price(self, name: str, steps: Steps) -> QoS:
+        count, known = len(steps), self.prices[name]
+        l95, rates, (uncut, *own) = steps.sums()
+        l95_ms, l95_error_ms = _estimated(
+            l95, count, known.l95_ms, known.l95_error_ms, usual=self._usual[name][0]
+        )
+        violation_rate, violation_error = _estimated(
+            rates,
+            count,
+            known.violation_rate,
+            known.violation_error,
+            usual=self._usual[name][1],
+            cycles=count * self._step * self._window,
+        )
+        l95_ms = min(l95_ms, self._censor_ms)
+        uncut_ms = max(uncut / count, l95_ms)
+        shares = [share / count for share in own]
+        return unchecked_qos(
+            l95_ms,
+            min(violation_rate, 1.0),
+            FrozenDict(zip(self._resources, shares, strict=True)),
+            None if uncut_ms == l95_ms else uncut_ms,
+            (l95_error_ms, violation_error),
+        )
+
+    def is_full(self, name: str) -> bool:
+        """Whether a candidate's price has the most steps (`KEPT`)."""
+        return len(self._twins[name].steps) == KEPT
+
+
+def _estimated(
+    steps: SeriesSums,
+    count: int,
+    known: float,
+    known_error: float,
+    *,
+    usual: float,
+    cycles: int | None = None,
+) -> tuple[float, float]:
+    """Return the mean over `count` steps, with its standard error.
+
+    The same realisation is also simulated as declared; longer simulations give its expected value
+    `known`, with error `known_error`. If the difference between the two varies less than the
+    measured conditions do, its mean is added to `known` (a control variate; DOI
+    10.1287/opre.30.5.961). `usual` is the standard deviation of a step as declared, since few steps
+    may vary too little; `cycles` is the number of cycles if the mean is a share of cycles.
+    """
+    mean, squares, products, more, more_squares, more_products, apart = steps
+    if not apart:
+        return known, known_error
+    error = _error(count, mean, squares, products, usual)
+    more_error = _error(count, more, more_squares, more_products)
+    if cycles is not None:
+        error = max(error, unseen_error(mean, cycles))
+        more_error = max(more_error, unseen_error(apart / count, cycles))
+    more_error = math.hypot(more_error, known_error)
+    return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
+
+
+def _mean(windows: Floats | Ints) -> float:
+    # Most steps are one window.
+    return float(windows.item() if len(windows) == 1 else windows.mean())
+
+
+def _mean_shares(windows: Floats) -> list[float]:
+    mean: Floats = windows[0] if len(windows) == 1 else windows.mean(axis=0)
+    shares: list[float] = mean.tolist()
+    return shares
+
+
+def _error(count: int, mean: float, squares: float, products: float, usual: float = 0.0) -> float:
+    """Return the error of a mean as if one more value deviated by `usual` (see `SeriesSums`)."""
+    if count < 2:
+        return abs(mean)
+    # A deviation from few values is itself uncertain: about Student's t over 2.
+    few = (count + 1) / (count - 1)
+    variance = max(squares / (count - 1), (squares + usual * usual) / count)
+    factor = _correlation_factor(count, squares, products)
+    return few * math.sqrt(variance / count * factor)
+
+
+def _correlation_factor(count: int, squares: float, products: float) -> float:
+    """Return the factor by which correlated steps of a queue increase the variance of a mean.
+
+    It is (1 + r) / (1 - r) for an AR(1) process, where r is the correlation of successive steps.
+    An estimate from n steps is 1 / n too low.
+    """
+    if not squares:
+        return 1.0
+    r = min(max(products / squares + 1.0 / count, 0.0), MOST_ALIKE)
+    return (1.0 + r) / (1.0 - r)
