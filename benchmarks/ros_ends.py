@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,8 @@ LINKS = (
     (100, "reliable", 50),
 )
 LINK_PORT = 7_448
+#: Key of messages without Dwell.
+BARE = "bare"
 
 
 class Frames(CellStage):
@@ -102,22 +105,32 @@ class Echoed(Publishing):
         """Open a session for the subscriber, too."""
         super().start()
         self._count = 0
-        self._bare = opened(ROUTER)
-        self._subscriber = self._bare.declare_subscriber(key_of(COMMANDS, TWIST), self._take)
+        self._bare, self._out = opened(ROUTER), opened(ROUTER)
+        self._kept = [
+            self._bare.declare_subscriber(key_of(COMMANDS, TWIST), self._take),
+            self._bare.declare_subscriber(BARE, self._take_bare),
+        ]
+        self._publisher = self._out.declare_publisher(BARE, express=True)
 
     def stop(self) -> None:
-        """Close both sessions."""
+        """Close all sessions."""
         self._bare.close()
+        self._out.close()
         super().stop()
 
     def apply(self, command: Message) -> None:
-        """Publish, then write the number of the message."""
+        """Publish, then write the number of the message; then the same without Dwell."""
         super(Publishing, self).apply(command)
         self._count += 1
         self.book.note(self._count, 0)
+        self._publisher.put(self._count.to_bytes(8, "little") + ZERO)
+        self.book.note(self._count, 2)
 
     def _take(self, sample: Any) -> None:
         self.book.note(Attachment.read(sample.attachment.to_bytes()).sequence, 1)
+
+    def _take_bare(self, sample: Any) -> None:
+        self.book.note(int.from_bytes(sample.payload.to_bytes()[:8], "little"), 3)
 
 
 class Turning:
@@ -157,7 +170,7 @@ def measure(quick: bool) -> Section:
             Figure(f"bare Zenoh, the image alone, p{share}", each[2], "ms"),
             Figure(f"the ROS ends add, p{share}", added, "ms", goal),
         ]
-    figures += [_intervals(8.0 if quick else COMMANDS_S)]
+    figures += _intervals(8.0 if quick else COMMANDS_S)
     notes = [
         "a command counts once it is published; `bare` is what a subscriber beside the cell sees"
     ]
@@ -176,8 +189,8 @@ def measure(quick: bool) -> Section:
     return Section(title, figures, notes)
 
 
-def _intervals(seconds: float) -> Figure:
-    """Return the share of intervals of the command's topic that are those of `apply`."""
+def _intervals(seconds: float) -> Iterator[Figure]:
+    """Yield the shares of intervals at a subscriber that are those of `apply`, or of a bare put."""
     found = document("ros-commands", period_ms=COMMANDS_MS)
     found["tasks"]["control"]["run"] = "benchmarks.ros_ends:Turning"
     found["live"]["actuators"] = {"control": "benchmarks.ros_ends:Echoed"}
@@ -188,19 +201,25 @@ def _intervals(seconds: float) -> Figure:
     ):
         time.sleep(seconds)
         noted: Sequence[Applied] = cell.applied()
-    # The record's second number is the side.
-    sides: tuple[dict[int, int], dict[int, int]] = {}, {}
+    # The record's second number is the side: sent and arrived, then the same without Dwell.
+    sides: list[dict[int, int]] = [{}, {}, {}, {}]
     for one in noted:
         sides[one.released_ns][one.cycle] = one.at_ns
-    applied, arrived = sides
+    hertz = 1e3 / COMMANDS_MS
+    what = f"intervals at {hertz:g} Hz within {EQUAL_MS:g} ms: of a topic and apply()"
+    yield Figure(what, [_equal(*sides[:2])], "%", Goal(low=99))
+    yield Figure("  of a bare subscriber and a bare put", [_equal(*sides[2:])], "%")
+
+
+def _equal(sent: Mapping[int, int], arrived: Mapping[int, int]) -> float:
+    """Return the share of the intervals between neighbours that are equal at both sides, %."""
+    known = sorted(sent.keys() & arrived.keys())[SETTLES:]
     changes = [
-        (arrived[number] - arrived[number - 1]) - (applied[number] - applied[number - 1])
-        for number in sorted(applied.keys() & arrived.keys())[SETTLES:]
-        if number - 1 in applied and number - 1 in arrived
+        (arrived[number] - arrived[before]) - (sent[number] - sent[before])
+        for before, number in pairwise(known)
+        if number == before + 1
     ]
-    equal = 100 * float(np.mean(np.abs(changes) <= EQUAL_MS * 1e6))
-    what = f"intervals of a topic at {1e3 / COMMANDS_MS:g} Hz within {EQUAL_MS:g} ms of apply()"
-    return Figure(what, [equal], "%", Goal(low=99))
+    return 100 * float(np.mean(np.abs(changes) <= EQUAL_MS * 1e6))
 
 
 def _over_a_link(
