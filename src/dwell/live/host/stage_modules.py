@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import asdict
 from pathlib import Path
 
 from dwell.errors import LiveError, lacking, missing_package
@@ -72,7 +73,7 @@ def stage_of(problem: Problem, name: str, index: int = 0) -> CellStage:
     if task.ros2 is not None:
         from dwell.live.ros2 import Source
 
-        stage: CellStage = Source.of(task.ros2)
+        stage: CellStage = Source(**asdict(task.ros2))
     elif task.run is not None:
         stage = load_stage(task.run, where)
     else:
@@ -89,7 +90,7 @@ def actuator_of(problem: Problem, name: str) -> CellActuator:
     if isinstance(given, RosActuator):
         from dwell.live.ros2 import Sink
 
-        actuator: CellActuator = Sink.of(given.ros2)
+        actuator: CellActuator = Sink(**asdict(given.ros2))
     else:
         actuator = load_actuator(given, where)
     _prepare(actuator, where, problem, name)
