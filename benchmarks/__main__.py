@@ -26,6 +26,8 @@ BENCHMARKS = {
     "sooner": ("sooner", "measure"),
     "passing": ("passing_faults", "measure"),
     "errors": ("stated_errors", "measure"),
+    "placements": ("placements", "measure"),
+    "schedulers": ("placements", "schedulers"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),

@@ -61,7 +61,7 @@ def measure(quick: bool) -> Section:
     cpus = sorted(os.sched_getaffinity(0))
     figures: list[Figure] = []
     with tempfile.TemporaryDirectory() as folder, _example(Path(folder)) as cell:
-        bound = cell.problem.controller.guard_cycles + 1
+        bound = cell.problem.controller.guard_cycles + cell.problem.pipeline.open_cycles
         for load in (0, 2 * len(cpus)):
             with _busy(cpus, load):
                 figures += _figures(_watch(cell, times), f"{load} busy, " if load else "", bound)

@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 26_445, "live": 15_566, "lab": 6_818}
+MOST = {"simulator": 26_490, "live": 15_583, "lab": 6_818}
 
 
 def code_lines(text: str) -> int:

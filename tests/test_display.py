@@ -145,7 +145,7 @@ def objects(
     known = QoS(20.0, 0.0, dict.fromkeys(canonical.fabric.nodes, 0.5))
     proposal = controller.propose_by(known, dict.fromkeys(canonical.fabric.nodes, 0.5))
     table = TraceTable("drive.csv", {"rtt_ms": np.arange(5_000.0)})
-    guard = {"guard_cycles": 3, "period_ns": 1, "probe_cycles": 30}
+    guard = {"patience_ns": 3, "probe_cycles": 30}
     policies = ("dtp", "latency-first", "work-function", "atp", "atp-thresholds", "cusum", "LOC")
     files = ("fan-in.yaml", "cloud.yaml", "live/cell.yaml", "visual_servoing/testbed.yaml")
     trees: list[object] = [

@@ -31,7 +31,7 @@ VALUES: list[tuple[tuple[str | int, ...], object, str, tuple[str, ...]]] = [
     (("period_ms",), 10**400, "period_ms", ("401 digits", "to 1e9")),
     (("period_ms",), None, "period_ms", ("nothing is given",)),
     (("period_ms",), [40], "period_ms", ("a list", "a number")),
-    (("deadline_ms",), 50, "deadline_ms", ("50", "at most period_ms = 40")),
+    (("deadline_ms",), 2561, "deadline_ms", ("2561", "at most 64 period_ms = 2560")),
     (("deadline_ms",), -1, "deadline_ms", ("-1", "from 1e-6 to 1e9")),
     (("window_cycles",), 0, "window_cycles", ("0", "a whole number from 1 to 1000000")),
     (("window_cycles",), 1.5, "window_cycles", ("1.5", "a whole number")),
@@ -374,7 +374,7 @@ def test_a_value_at_fault(
 FIVE = """\
 dwell: 1
 period_ms: 40
-deadline_ms: 50
+deadline_ms: 5000
 nodes:
   R: {tier: robot, cores: 0}
   E: {tier: edge}
@@ -394,7 +394,7 @@ candidates:
 """
 
 EXPECTED = {
-    (3, "deadline_ms"): "at most period_ms = 40",
+    (3, "deadline_ms"): "at most 64 period_ms = 2560",
     (5, "nodes.R.cores"): "from 1 to 4096",
     (8, "links[0].to"): "unknown node 'F'",
     (8, "links[0].delay_ms.lognormal.mean"): "-1 is not allowed",
@@ -417,7 +417,7 @@ def test_structure_and_meaning_are_reported_in_one_pass(tmp_path: Path) -> None:
         assert words in found[where]
     lines = str(error).splitlines()
     assert len(lines) == len(EXPECTED)
-    assert lines[0].startswith(f"{path}:3: deadline_ms: 50")
+    assert lines[0].startswith(f"{path}:3: deadline_ms: 5000")
     assert [fault.line for fault in error.faults] == sorted(line for line, _ in EXPECTED)
     assert str(pickle.loads(pickle.dumps(error))) == str(error)
 

@@ -410,9 +410,9 @@ def test_settings_are_checked_at_every_point(folder: Path) -> None:
 
 
 def test_values_that_only_together_make_no_cell_are_named_together(folder: Path) -> None:
-    more = "parameters: {period_ms: [40, 20], objective.weights.edge: [1, 2]}\n"
+    more = "parameters: {period_ms: [40, 0.5], objective.weights.edge: [1, 2]}\n"
     found = faults(folder, LEAST + more)
-    assert found["parameters"].endswith("(at period_ms = 20, objective.weights.edge = 2)")
+    assert found["parameters"].endswith("(at period_ms = 0.5, objective.weights.edge = 2)")
     assert "deadline_ms" in found["parameters"]
 
 

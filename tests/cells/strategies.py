@@ -291,7 +291,7 @@ def problems(draw: st.DrawFn) -> Problem:
             tasks,
             tuple(Flow(a, b, draw(_whole(0, 10**12))) for a, b in chosen),
             period_ms,
-            draw(_reals(1e-6, period_ms)),
+            draw(_reals(1e-6, min(64 * period_ms, 1e9))),
             draw(processes()),
             scales,
         ),

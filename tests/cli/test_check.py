@@ -119,7 +119,7 @@ def test_check_prints_every_fault_with_its_line(cell: Path) -> None:
             "E: {exec_ms: 2}}}",
             "E: {exec_ms: 2}}}\ncontroller: {fallbacks: [LOC], close_grace_ms: 59}\n"
             "live: {hosts: {R: {port: 7000}}}",
-            ("controller.close_grace_ms: 59 is less", "= 60 ms", "7 cycles", "instead of 4"),
+            ("controller.close_grace_ms: 59 is less", "of 60 ms", "7 cycles", "instead of 4"),
         ),
         (
             "E: {exec_ms: 2}}}",

@@ -42,7 +42,7 @@ def capped(problem: Problem, caps: str) -> Problem:
 
 
 def deciding_often(problem: Problem, rng: Random) -> Problem:
-    """Draw how often it decides, and for how long a placement has to stay."""
+    """Draw how often it decides, how long a placement has to stay, and the deadline."""
     width = problem.window_cycles
     controller = replace(
         problem.controller,
@@ -50,7 +50,9 @@ def deciding_often(problem: Problem, rng: Random) -> Problem:
         min_dwell=rng.choice([0, 0, 1, 3]),
         min_dwell_cycles=rng.choice([0, rng.randint(0, 3 * width)]),
     )
-    return replace(problem, controller=controller)
+    deadline_ms = problem.pipeline.period_ms * rng.choice([1.0, 3.5, 8.0])
+    pipeline = replace(problem.pipeline, deadline_ms=deadline_ms)
+    return replace(problem, controller=controller, pipeline=pipeline)
 
 
 @pytest.mark.parametrize("policy", RULES)

@@ -34,8 +34,7 @@ WHOLE = {"LOC": True, "HYB": True, "SO": True}
 def guard(*fallbacks: str, g: int = 3, h: int = 5, placement: str = "SO") -> Guard:
     return Guard(
         fallbacks or ("LOC", "HYB"),
-        guard_cycles=g,
-        period_ns=P,
+        patience_ns=g * P,
         probe_cycles=h,
         placement=placement,
     )
@@ -141,17 +140,15 @@ def test_after_its_own_outage_it_begins_anew() -> None:
 
 
 def test_no_fallbacks_no_guard() -> None:
-    mine = Guard((), guard_cycles=3, period_ns=P, probe_cycles=5, placement="SO")
+    mine = Guard((), patience_ns=3 * P, probe_cycles=5, placement="SO")
     released(mine, range(9))
     assert mine.due_ns is None
     assert not fires(mine, 10**9)
 
 
-@pytest.mark.parametrize(
-    ("name", "value"), [("guard_cycles", 1), ("period_ns", 0), ("probe_cycles", 0)]
-)
+@pytest.mark.parametrize(("name", "value"), [("patience_ns", 0), ("probe_cycles", 0)])
 def test_settings_out_of_their_range_are_refused(name: str, value: int) -> None:
-    settings = {"guard_cycles": 3, "period_ns": P, "probe_cycles": 5, name: value}
+    settings = {"patience_ns": 3 * P, "probe_cycles": 5, name: value}
     with pytest.raises(ProblemError, match=name):
         Guard(("LOC",), **settings, placement="SO")
 
@@ -495,21 +492,23 @@ def test_an_order_begins_anew() -> None:
 
 
 @given(data=st.data(), g=st.integers(2, 4), h=st.integers(1, 12), f=st.integers(1, 4))
-def test_f_plus_1_times_g_plus_1_cycles_at_most_once_a_fallback_can_carry(
-    data: st.DataObject, g: int, h: int, f: int
+@pytest.mark.parametrize("open_cycles", [1, 5])
+def test_f_plus_1_times_g_plus_n_cycles_at_most_once_a_fallback_can_carry(
+    open_cycles: int, data: st.DataObject, g: int, h: int, f: int
 ) -> None:
+    # D is n = `open_cycles` periods; the guard's patience is D and g - 1 periods.
+    patience = g + open_cycles - 1
     names = [f"F{i}" for i in range(f)]
     everything = ["SO", *names]
     mine = Guard(
         names,
-        guard_cycles=g,
-        period_ns=P,
+        patience_ns=patience * P,
         probe_cycles=h,
         placement=data.draw(st.sampled_from(everything)),
     )
-    cell = Cell(mine, latency=data.draw(st.integers(0, (g - 1) * P - 1)))
+    cell = Cell(mine, latency=data.draw(st.integers(0, (patience - 1) * P - 1)))
     subsets = st.sets(st.sampled_from(everything))
-    for cycles in data.draw(st.lists(st.integers(1, 3 * g + h), max_size=5)):
+    for cycles in data.draw(st.lists(st.integers(1, 3 * patience + h), max_size=5)):
         cell.able, whole, heard = (data.draw(subsets) for _ in range(3))
         cell.heard = {name: name in heard | whole for name in everything}
         cell.whole = {name: name in whole for name in everything}
@@ -521,12 +520,13 @@ def test_f_plus_1_times_g_plus_1_cycles_at_most_once_a_fallback_can_carry(
     cell.able = data.draw(st.sets(st.sampled_from(names), min_size=1))
     cell.heard = dict.fromkeys(everything, True)
     cell.whole = {name: name in cell.whole for name in everything}
-    cell.play((f + 2) * (g + 1) + 70 * h)
-    lost = itertools.takewhile(lambda cycle: not cell.done[cycle], range(begun, len(cell.done) - g))
+    cell.play((f + 2) * (patience + 1) + 70 * h)
+    known = range(begun, len(cell.done) - patience)
+    lost = itertools.takewhile(lambda cycle: not cell.done[cycle], known)
     stretches = itertools.groupby(lost, key=lambda cycle: cell.resting[cycle])
     for resting, stretch in stretches:
-        assert resting or len(list(stretch)) <= (f + 1) * (g + 1)
-    assert all(cell.done[-g - 4 : -g])
+        assert resting or len(list(stretch)) <= (f + 1) * (g + open_cycles)
+    assert all(cell.done[-patience - 4 : -patience])
 
 
 # ---------------------------------------------------------------------------- failures

@@ -218,9 +218,14 @@ LINK = {"link": "R->E"}
             "scenarios.s[0].rate_mbps",
             ("5 instead of 5e+06",),
         ),
-        (cell(live={"max_age_ms": 13.9}), "live.max_age_ms", ("13.9 is less", "of SO, 14 ms")),
         (
-            linked(delay_ms={"uniform": {"low": 8, "high": 20}}) | {"live": {"max_age_ms": 27}},
+            cell(deadline_ms=13, live={"max_age_ms": 13.9}),
+            "live.max_age_ms",
+            ("13.9 is less", "of SO, 14 ms"),
+        ),
+        (
+            linked(delay_ms={"uniform": {"low": 8, "high": 20}})
+            | {"deadline_ms": 25, "live": {"max_age_ms": 27}},
             "live.max_age_ms",
             ("27 is less", "of SO, 28 ms"),
         ),
@@ -287,7 +292,7 @@ def test_what_is_never_meant_is_said(
         side_by_side((6, 3), (6, 3), (6, 3)),
         linked(rate_mbps=1e6),
         disturbed({**LINK, "rate_mbps": 1e5}),
-        cell(live={"max_age_ms": 32}),
+        cell(deadline_ms=30, live={"max_age_ms": 32}),
     ],
 )
 def test_what_is_near_it_is_not(document: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,3 +60,10 @@ def test_every_column_is_for_itself() -> None:
 @pytest.mark.parametrize(("cycles", "periods"), [(1, 0), (2, 1), (3, 2), (100, 2)])
 def test_the_patience_is_never_longer_than_the_window(cycles: int, periods: int) -> None:
     assert patience_ns(cell(cycles, 33.3)) == round(periods * 33.3 * MS)
+
+
+@pytest.mark.parametrize(("cycles", "periods"), [(1, 3), (2, 4), (3, 5), (100, 5)])
+def test_beyond_the_period_the_patience_grows_with_the_deadline(cycles: int, periods: int) -> None:
+    problem = cell(cycles, 10.0)
+    problem = replace(problem, pipeline=replace(problem.pipeline, deadline_ms=40.0))
+    assert patience_ns(problem) == periods * 10 * MS

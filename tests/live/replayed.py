@@ -12,12 +12,12 @@ import polars as pl
 import pytest
 
 import dwell
-from dwell.control import ClosedWindow, Controller, Evidence
+from dwell.control import ClosedWindow, Controller, Evidence, overtaken_cycles
 from dwell.estimators import Profile
 from dwell.live.roles.live_windows import LiveWindows
 from dwell.live.roles.offsets import Offsets
 from dwell.live.roles.run_rows import Rows, columns_of
-from dwell.live.wire.messages import Completion, Hop, Load, Stamp
+from dwell.live.wire.messages import ACTUATED, BEHIND, Completion, Hop, Load, Stamp
 from dwell.model import FrozenDict, Problem, QoS
 from dwell.record import Journal, Run, seal_run
 from dwell.sim import engine
@@ -171,6 +171,8 @@ def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list
         hops.setdefault(whose, []).append(hop)
     events: list[Event] = []
     term, before = 1, None
+    table = run.arrays("cycles")
+    overtaken = overtaken_cycles(table["release_ns"], table["latency_ns"])
     for entry in run.cycles.iter_rows(named=True):
         cycle, placement, released_ns = entry["cycle"], entry["placement"], entry["release_ns"]
         term += before is not None and placement != before
@@ -181,7 +183,8 @@ def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list
             done_ns = released_ns + entry["latency_ns"]
             mine = tuple(hops[cycle, False])
             shown_ns = clocks.at("R2", done_ns)
-            done = Completion(stamp, "control", shown_ns, "actuated", mine, "R2")
+            outcome = BEHIND if overtaken[cycle] else ACTUATED
+            done = Completion(stamp, "control", shown_ns, outcome, mine, "R2")
             events.append((done_ns, 1, completing(done)))
         stop_ns = discarded.get(cycle, -1)
         if stop_ns >= 0:
@@ -240,8 +243,10 @@ def replay(
     timed = sorted(((event[0] + late(event), *event[1:]) for event in events), key=lambda e: e[:2])
     for number, (t_ns, _, hear) in enumerate(timed):
         hear(windows, now(t_ns))
-        following_ns = timed[number + 1][0] if number + 1 < len(timed) else t_ns
-        while (due_ns := windows.due_ns(now(t_ns))) is not None and due_ns <= now(following_ns):
+        following_ns, kind = timed[number + 1][:2] if number + 1 < len(timed) else (t_ns, 3)
+        # At one instant loads (0) and completions (1) precede a close, and stamps (3) follow it.
+        following = now(following_ns), kind
+        while (due_ns := windows.due_ns(now(t_ns))) is not None and (due_ns, 2) < following:
             window = windows.close()
             assert window.evidence is not None
             evidence.append(window.evidence())

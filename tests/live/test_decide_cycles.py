@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from random import Random
@@ -37,7 +38,10 @@ def often(every: int, **settings: object) -> Problem:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_simulated_run_is_decided_on_in_the_same_way_live(seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("deadline_ms", [100 / 3, 150])
+def test_a_simulated_run_is_decided_on_in_the_same_way_live(
+    deadline_ms: float, seed: int, tmp_path: Path
+) -> None:
     draw = Random(seed)
     scenario = draw.choice(["robot-cpu-stress", "network-impairment", "edge-cpu-stress"])
     problem = often(
@@ -47,6 +51,7 @@ def test_a_simulated_run_is_decided_on_in_the_same_way_live(seed: int, tmp_path:
         order_lead_cycles=2,
         fallbacks=(),
     )
+    problem = replace(problem, pipeline=replace(problem.pipeline, deadline_ms=deadline_ms))
     played = simulate(problem, scenario, windows=20, seed=seed)
     _, controller, _, _, rows = replay(played, SYNCHRONOUS, messages_of(played, Clocks()))
     live, simulated = recorded(tmp_path, controller, rows), played.run

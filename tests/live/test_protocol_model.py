@@ -170,8 +170,7 @@ class MirroredGuard:
     def __init__(self) -> None:
         self.guard = Guard(
             fallbacks.FALLBACKS,
-            guard_cycles=2,
-            period_ns=1,
+            patience_ns=2,
             probe_cycles=8,
             placement=fallbacks.WANTED,
         )

@@ -53,7 +53,7 @@ def test_values_of_every_part() -> None:
         ("objective.weights.egde", 3, "unknown key 'egde'; did you mean 'edge'?"),
         ("nodes.E9.cores", 3, "no 'E9'"),
         ("links[99].loss", 0.1, "there is no links[99]"),
-        ("deadline_ms", 1e6, "at most period_ms"),
+        ("deadline_ms", 1e6, "at most 64 period_ms"),
         ("tasks.perception.on.R1.threads", 0, "0 is not allowed"),
     ],
 )

@@ -22,7 +22,7 @@ EXECUTION = Execution(Constant(1.0))
         (lambda: Task("a", {"R": EXECUTION}, depth=-1), "input", "a whole number from 0"),
         (lambda: Flow("a", "b", -1), "bytes", "from 0 to 1e12"),
         (lambda: Pipeline({"b": Task("a", {"R": EXECUTION})}, (), 1, 1), "tasks.b", "its key"),
-        (lambda: Pipeline({}, (), 1, 2), "deadline_ms", "at most period_ms = 1"),
+        (lambda: Pipeline({}, (), 1, 64.5), "deadline_ms", "at most 64 period_ms = 64"),
     ],
 )
 def test_what_a_constructor_refuses(make: Callable[[], object], path: str, words: str) -> None:

@@ -23,6 +23,7 @@ from dwell.model import (
     FrozenDict,
     Link,
     LinkDisturbance,
+    LiveSettings,
     MovingTarget,
     Node,
     NodeDisturbance,
@@ -135,6 +136,11 @@ PLACED = {"a": "R", "b": "R"}
             lambda: replace(_problem(), servo=Servo("integrator", 1.0, MovingTarget(1.0, 0.019))),
             "servo.target.period_s",
             "at least 0.02",
+        ),
+        (
+            lambda: replace(_problem(), live=LiveSettings(max_age_ms=9.9)),
+            "live.max_age_ms",
+            "at least deadline_ms = 10",
         ),
         (lambda: replace(_problem(), window_cycles=0), "window_cycles", "from 1"),
         (lambda: replace(_problem(), warmup_windows=-1), "warmup_windows", "from 0"),
@@ -284,3 +290,18 @@ def test_all_alternatives_together_are_sent_every_cycle_at_most(
 
 def test_a_lone_candidate_has_a_shadow_fraction_too() -> None:
     assert many(1).shadow_fraction == 0.05
+
+
+@pytest.mark.parametrize(
+    ("deadline_ms", "max_age_ms", "open_cycles", "patience_ms"),
+    [(4.0, 20.0, 1, 30.0), (10.0, 20.0, 1, 30.0), (11.0, 21.0, 2, 31.0), (640.0, 650.0, 64, 660.0)],
+)
+def test_what_follows_from_a_deadline(
+    deadline_ms: float, max_age_ms: float, open_cycles: int, patience_ms: float
+) -> None:
+    problem = _problem()
+    problem = replace(problem, pipeline=replace(problem.pipeline, deadline_ms=deadline_ms))
+    assert problem.max_age_ms == max_age_ms
+    assert problem.pipeline.open_cycles == open_cycles
+    # g is 3.
+    assert problem.guard_patience_ns == patience_ms * 1e6

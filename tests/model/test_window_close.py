@@ -18,7 +18,7 @@ PROBLEM = make_problem([Node("R", "robot")], [Task("a", {"R": Execution(Constant
 
 @given(
     st.floats(1.0, 100.0),
-    st.floats(0.1, 1.0),
+    st.floats(0.1, 64.0),
     st.floats(0.0, 50.0),
     st.lists(st.integers(0, 10**8), min_size=2, max_size=20),
 )

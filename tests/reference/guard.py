@@ -42,7 +42,7 @@ class Through:
 
 
 class Guard:
-    """Whether the cell moves by itself, and where to; its `patience` are g periods."""
+    """Whether the cell moves by itself, and where to; its `patience` is max(D, P) + (g - 1) P."""
 
     def __init__(self, problem: Problem, patience: int) -> None:
         settings = problem.controller
@@ -126,7 +126,7 @@ class Guard:
     # ---------------------------------------------------------------------------- whether it fires
 
     def fires(self, now: int) -> bool:
-        """Whether the cycle that it waits for is g periods old."""
+        """Whether the cycle that it waits for is as old as the patience."""
         first = max(self.newest + 1, self.stay.watched, self.restarted)
         waited = self.due[bisect_left(self.due, first) :][:1]
         return any(self.released[cycle] + self.patience <= now for cycle in waited)
@@ -200,7 +200,7 @@ class Proof:
         self.wanted, self.released, self.newest, self.count = candidate, {}, -1, 0
 
     def silent_since(self) -> int:
-        """Return when the probe after the newest that was heard of is g periods old."""
+        """Return when the probe after the newest that was heard of is as old as the patience."""
         later = [at for probe, at in self.released.items() if probe > self.newest]
         return later[0] + self.patience if later else NEVER
 

@@ -804,7 +804,8 @@ class Simulation:
         self.migration = 0
         self.moving = False
 
-        self.patience = self.settings.guard_cycles * nanoseconds(self.pipeline.period_ms)
+        period, deadline = map(nanoseconds, (self.pipeline.period_ms, self.pipeline.deadline_ms))
+        self.patience = max(deadline, period) + (self.settings.guard_cycles - 1) * period
         self.guard = Guard(problem, self.patience) if guarded else None
         self.proof = Proof(problem, self.patience)
         self.decisions: list[Decision] = []

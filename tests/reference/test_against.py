@@ -213,6 +213,7 @@ def make_case(
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
     if in_order:
         problem = with_order(problem, Random(seed), whole_ms=whole_ms)
+    problem = with_deadline(problem, Random(f"{seed} deadline"), whole_ms=whole_ms)
     if rates:
         problem = with_rates(problem, Random(f"{seed} rates"), idle=idle)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
@@ -252,6 +253,16 @@ def deciding_often(case: Case, rng: Random) -> Case:
     )
 
 
+def with_deadline(problem: Problem, rng: Random, *, whole_ms: bool) -> Problem:
+    """Let one problem in two have a deadline of one to eight periods."""
+    pipeline = problem.pipeline
+    if rng.random() < 0.5:
+        return problem
+    deadline_ms = pipeline.period_ms * rng.uniform(1, 8)
+    deadline_ms = math.ceil(deadline_ms) if whole_ms else deadline_ms
+    return replace(problem, pipeline=replace(pipeline, deadline_ms=deadline_ms))
+
+
 def with_order(problem: Problem, rng: Random, *, whole_ms: bool) -> Problem:
     """Let all links keep order and lose messages, and most of them send what is lost again."""
     links = {}
@@ -274,7 +285,7 @@ def jittered(case: Case, rng: Random, *, whole_ms: bool) -> Case:
     late_ms = [rng.uniform(0, longest_ms) for _ in real.release_ns]
     late_ns = np.rint(np.round(late_ms) * MS if whole_ms else np.array(late_ms) * MS)
     release_ns = np.maximum.accumulate(real.release_ns + late_ns.astype(np.int64))
-    deadline_ms = rng.choice([pipeline.deadline_ms, pipeline.period_ms])
+    deadline_ms = rng.choice([pipeline.deadline_ms, max(pipeline.period_ms, pipeline.deadline_ms)])
     problem = replace(case.problem, pipeline=replace(pipeline, deadline_ms=deadline_ms))
     return replace(case, problem=problem, real=replace(real, release_ns=release_ns))
 
@@ -489,6 +500,8 @@ def window_differences(
         for column in ("violation_rate", "seen_violation_rate"):
             if row[column] not in (missed, None):
                 yield f"{where}: {column} {row[column]}, expected {missed}"
+        if row["overtaken"] != (overtaken := sum(overtaken_in(case, result)[first:last])):
+            yield f"{where}: overtaken {row['overtaken']}, expected {overtaken}"
         placed = [active for active, _ in result.stamps[first:last]]
         if (row["placement"], row["mixed"]) != (placed[0], len(set(placed)) > 1):
             yield f"{where}: {row['placement']}, mixed {row['mixed']}, expected {placed}"
@@ -502,6 +515,16 @@ def window_differences(
             for column, value in ((f"u_{name}", busy), (f"shadow_{name}", shadow)):
                 if abs(row.get(column, 0.0) - value) > 1e-6:
                     yield f"{where}: {column} {row[column]}, expected {value}"
+
+
+def overtaken_in(case: Case, result: Result) -> list[bool]:
+    """Whether each cycle has completed after a later one."""
+    releases = case.real.release_ns.tolist()
+    known = zip(releases, (cycle.latency_ns for cycle in result.cycles), strict=False)
+    ends = [math.inf if latency is None else release + latency for release, latency in known]
+    return [
+        end < math.inf and any(later < end for later in ends[i + 1 :]) for i, end in enumerate(ends)
+    ]
 
 
 def cost_differences(

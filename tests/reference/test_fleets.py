@@ -138,6 +138,8 @@ def test_fleets_are_one_cell_with_the_pipelines_of_all() -> None:
         count = random.randint(2, 4)
         period_ms = cell.pipeline.period_ms
         phases = [round(random.uniform(0, period_ms / 2), 6) for _ in range(count)]
+        deadline_ms = period_ms * random.choice([1.0, 1.0, random.uniform(1, 8)])
+        cell = replace(cell, pipeline=replace(cell.pipeline, deadline_ms=deadline_ms))
         fleet = Fleet(
             "all", (FleetEntry(cell, count),), ("E",), phases=tuple(phases), coordination="none"
         )

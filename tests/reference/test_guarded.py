@@ -135,7 +135,7 @@ class _Maker:
             links=self.links,
             candidates=candidates,
             period_ms=self.period_ms,
-            deadline_ms=self.period_ms * rng.choice([0.5, 1.0]),
+            deadline_ms=rng.choice([0.5 * self.period_ms, self.period_ms, self.periods(10, 80)]),
             scenario=disturbances,
             window_cycles=rng.choice([1, 2, 3, 8]),
             controller=self.controller(),

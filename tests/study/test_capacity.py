@@ -264,8 +264,9 @@ def test_changes_that_may_help(quiet: Fleet) -> None:
     ]
 
 
-def test_a_later_deadline_where_the_period_allows_it() -> None:
-    cell = within(one_job(period_ms=20.0), 9.0)
+@pytest.mark.parametrize("deadline_ms", [9.0, 30.0])
+def test_a_later_deadline_where_the_period_allows_it(deadline_ms: float) -> None:
+    cell = within(one_job(period_ms=20.0), deadline_ms)
     assert [change.text for change in changes_of(fleet_of((cell, 1), phases="even"))][:2] == [
         "deadlines 10 ms later",
         "a core more on E",

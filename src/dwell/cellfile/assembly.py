@@ -108,7 +108,7 @@ class Assembly:
         objective = self._objective(nodes)
         controller = self._section("controller", ControllerSettings)
         servo = self._servo()
-        live = self._section("live", LiveSettings)
+        live = self._live(timing)
         scenarios = self._scenarios()
         candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
         called = name if entry.name is None else entry.name
@@ -309,6 +309,12 @@ class Assembly:
         if servo is not None and not self.faults.at("period_ms"):
             self.faults.attempt("", servo.require_seen, self.entry.period_ms)
         return servo
+
+    def _live(self, timing: Pipeline | None) -> LiveSettings | None:
+        live: LiveSettings | None = self._section("live", LiveSettings)
+        if live is not None and timing is not None:
+            self.faults.attempt("", live.require_in_time, timing.deadline_ms)
+        return live
 
     # --------------------------------------------------------------------------- meaning
 

@@ -12,7 +12,7 @@ from dwell.control.guard import (
     parts_of,
 )
 from dwell.control.plain_rule import plain_rule
-from dwell.control.windows import final_l95_ms, moved_shares, seen_costs
+from dwell.control.windows import final_l95_ms, moved_shares, overtaken_cycles, seen_costs
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
@@ -36,6 +36,7 @@ __all__ = [
     "ShadowPlan",
     "final_l95_ms",
     "moved_shares",
+    "overtaken_cycles",
     "parts_of",
     "plain_rule",
     "seen_costs",

@@ -16,7 +16,7 @@ from typing import TypeAlias
 from dwell.control.course import Course
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import require
-from dwell.model.controller_settings import GUARD_CYCLES, PROBE_CYCLES
+from dwell.model.controller_settings import PROBE_CYCLES
 from dwell.model.instants import EVIDENCE_NS
 
 #: Largest number of doublings of the number of probes and of the length of a rest.
@@ -145,7 +145,8 @@ class FallbackRound:
 class Guard:
     """Decides when the cell must leave its placement without an order, and for which fallback.
 
-    The guard *fires* when the cycle after the newest completed cycle is g periods old. In detail:
+    The guard *fires* when the cycle after the newest completed cycle is as old as the *patience*,
+    max(D, P) + (g - 1) P: the deadlines of g cycles have then passed. In detail:
 
     * The *newest completed* cycle has the highest number of all completed cycles, in whatever order
       their completions arrive. A late completion of an older cycle and a cycle lost between two
@@ -153,17 +154,17 @@ class Guard:
     * The *cycle after* it is the first released cycle with a higher number, because the numbers
       have gaps when the stamper restarts. Before the first completion it is the first released
       cycle.
-    * The guard fires from g periods after the release of that cycle on, including that instant. A
-      completion at that instant counts first.
+    * The guard fires from the patience after the release of that cycle on, including that instant.
+      A completion at that instant counts first.
     * Every move restarts the wait. The guard waits only for cycles released after the move, and a
-      new placement has g periods to complete its first cycle. Late completions of earlier cycles
+      new placement has the patience to complete its first cycle. Late completions of earlier cycles
       change nothing.
     * The guard ignores completions of cycles that were never released here.
 
     The guard is *on a fallback* from its own move until the next order. A fallback *carries* the
-    cell once one of its cycles has completed. If none completes within g periods, the fallback has
-    failed, and the guard tries the next one at once. It tries each fallback once per round, in this
-    order:
+    cell once one of its cycles has completed. If none completes within the patience, the fallback
+    has failed, and the guard tries the next one at once. It tries each fallback once per round, in
+    this order:
 
     1. the fallback that carried the cell before an order left it, until a cycle has completed that
        was released more than `probe_cycles` cycles after the last one under that fallback;
@@ -180,22 +181,21 @@ class Guard:
     rest.
 
     **Bound.** Assume that the guard does not rest, and that f fallbacks are available, at least one
-    of which can carry the cell. Then at most (f + 1)(g + 1) consecutive cycles bring no actuation.
-    Each placement that fails costs its first lost cycle, the cycles released in the g periods after
-    it, and a cycle that may be released at the instant of the move. After a single fault the bound
-    is g + 1 if the first fallback works. (It is 2g + 1 if, within these g periods, an order takes
-    effect to another placement that the fault broke.) Without a fault, the guard does not fire
-    while every completion arrives within g periods of the release. If single cycles are lost, it
-    does not fire while the other completions arrive within g - 1 periods.
+    of which can carry the cell. Let n be D / P, rounded up: `Pipeline.open_cycles`. Then at most
+    (f + 1)(g + n) consecutive cycles bring no actuation. Each placement that fails costs its first
+    lost cycle, the cycles released in the patience after it, and a cycle that may be released at
+    the instant of the move. After a single fault the bound is g + n if the first fallback works.
+    (It is 2(g + n) - 1 if, within the patience, an order takes effect to another placement that the
+    fault broke.) Without a fault, the guard does not fire while every completion arrives within the
+    patience. If single cycles are lost, it does not fire while the other completions arrive one
+    period earlier.
 
     Parameters
     ----------
     fallbacks : iterable of str
         Candidates, best first. A guard without fallbacks never fires.
-    guard_cycles : int
-        g, at least 2.
-    period_ns : int
-        P.
+    patience_ns : int
+        Longest wait for a cycle after its release.
     probe_cycles : int
         Length of the first rest in cycles, at least 1; also the probes that prove a placement.
     placement : str
@@ -227,17 +227,15 @@ class Guard:
         self,
         fallbacks: Iterable[str],
         *,
-        guard_cycles: int,
-        period_ns: int,
+        patience_ns: int,
         probe_cycles: int,
         placement: str,
     ) -> None:
-        GUARD_CYCLES.check("guard_cycles", guard_cycles)
         PROBE_CYCLES.check("probe_cycles", probe_cycles)
-        require(period_ns > 0, "period_ns", period_ns, "at least 1")
+        require(patience_ns > 0, "patience_ns", patience_ns, "at least 1")
         self.probe_cycles = probe_cycles
         self.course = Course(placement)
-        self._silence = _Silence(guard_cycles * period_ns)
+        self._silence = _Silence(patience_ns)
         self._round = FallbackRound(fallbacks)
         # Last cycle before the last move, and last cycle before an order left the fallback.
         self._since = self._returned = -1
@@ -275,7 +273,7 @@ class Guard:
 
     @property
     def patience_ns(self) -> int:
-        """Longest wait for a cycle: g periods."""
+        """Longest wait for a cycle after its release."""
         return self._silence.patience_ns
 
     @property
@@ -414,11 +412,6 @@ class Guard:
         self._silence.forget()
 
 
-def _patience_ns(problem: Problem) -> int:
-    """Return the longest wait of a cell for a cycle: g periods."""
-    return problem.controller.guard_cycles * problem.pipeline.period_ns
-
-
 def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
     """Return the names of all parts that a candidate needs.
 
@@ -460,9 +453,9 @@ class Presence:
     def of(cls, problem: Problem) -> Presence:
         """Return the presence of a cell, with a largest age of g - 1 periods.
 
-        The last sign of life of a failed part may arrive up to one period after the release of the
-        first lost cycle. The guard checks g periods after that release, so a part counts as alive
-        only if its last sign of life is younger than g - 1 periods.
+        The last sign of life of a failed part may arrive up to max(D, P) after the release of the
+        first lost cycle. The guard checks g - 1 periods after that, so a part counts as alive only
+        if its last sign of life is younger than g - 1 periods.
         """
         period_ns = problem.pipeline.period_ns
         parts = {name: parts_of(problem, name) for name in problem.candidates}
@@ -516,9 +509,9 @@ class Failures:
 
     @classmethod
     def of(cls, problem: Problem) -> Failures:
-        """Return the failures of a cell, with k = g + 1 and a patience of g periods."""
+        """Return the failures of a cell, with k = g + 1 and the guard's patience."""
         in_a_row = problem.controller.failures_in_a_row
-        return cls(problem.candidates, in_a_row, _patience_ns(problem))
+        return cls(problem.candidates, in_a_row, problem.guard_patience_ns)
 
     def released(self, candidate: str, cycle: int, at_ns: int) -> None:
         """Record the release of a cycle or its shadow through a candidate."""
@@ -547,8 +540,8 @@ class Probation:
 
     A *probe* is the shadow of a cycle through the wanted placement. Every cycle has a probe while
     the policy or a person wants to leave the fallback. Once h probes have completed, the placement
-    is *proven* as long as it stays wanted. If the probe after the newest completed one becomes g
-    periods old, counting restarts, because the guard would have fired.
+    is *proven* as long as it stays wanted. If the probe after the newest completed one becomes as
+    old as the patience, counting restarts, because the guard would have fired.
 
     At first h equals `probe_cycles`. It doubles at every *relapse*: the guard fires before
     `health_cycles` cycles have completed since an order left the fallback. It halves, down to
@@ -562,7 +555,7 @@ class Probation:
     health_cycles : int
         Completed cycles after which the cell counts as healthy.
     patience_ns : int
-        g periods.
+        The guard's patience.
 
     Attributes
     ----------
@@ -606,7 +599,7 @@ class Probation:
         return cls(
             problem.controller.probe_cycles,
             health_cycles=HEALTH_WINDOWS * problem.window_cycles,
-            patience_ns=_patience_ns(problem),
+            patience_ns=problem.guard_patience_ns,
         )
 
     def __repr__(self) -> str:
@@ -708,8 +701,7 @@ class CellGuard(Guard):
         settings = problem.controller
         super().__init__(
             settings.fallbacks,
-            guard_cycles=settings.guard_cycles,
-            period_ns=problem.pipeline.period_ns,
+            patience_ns=problem.guard_patience_ns,
             probe_cycles=settings.probe_cycles,
             placement=placement or problem.initial,
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.cost import hamming, price, tier_nodes
 from dwell.model.instants import NEVER_NS
@@ -39,6 +40,21 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
         return int(np.count_nonzero(late))
     missed: Ints = np.asarray(np.count_nonzero(late, axis=-1))
     return missed
+
+
+def overtaken_cycles(release_ns: Ints, latency_ns: Ints) -> NDArray[np.bool_]:
+    """Return which cycles completed after a later cycle had.
+
+    Parameters
+    ----------
+    release_ns, latency_ns : int64 array, shape (n,)
+        Consecutive cycles of a run; `NEVER_NS` if a cycle has not completed.
+    """
+    done = latency_ns < NEVER_NS
+    at_ns = np.where(done, release_ns + latency_ns, NEVER_NS)
+    later_ns = np.minimum.accumulate(at_ns[::-1])[::-1]
+    overtaken: NDArray[np.bool_] = done & (later_ns < at_ns)
+    return overtaken
 
 
 def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Floats, Floats]:

@@ -411,13 +411,14 @@ def _terms(objective: Objective, profile: Profile, candidate: str) -> dict[str, 
 def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield candidates under which the guard would fire without a fault.
 
-    The guard fires when the cycle after the newest completed cycle is older than `guard_cycles`
-    periods. It also fires under a fallback, except just after it has moved the cell there.
+    The guard fires when the cycle after the newest completed cycle is older than its patience,
+    max(D, P) + (g - 1) P. It also fires under a fallback, except just after it has moved the cell
+    there.
     """
     settings = problem.controller
     if not settings.fallbacks:
         return
-    bound_ms = (settings.guard_cycles - 1) * problem.pipeline.period_ms
+    bound_ms = (problem.guard_patience_ns - problem.pipeline.period_ns) / 1e6
     for name, l95_ms in profile.l95_ms.items():
         needed_ms = l95_ms + _return_ms(problem, name)
         elsewhere = any(fallback != name for fallback in settings.fallbacks)
@@ -425,8 +426,8 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
             yield Fault(
                 "controller.guard_cycles",
                 f"{settings.guard_cycles} is tight for {name}: L95 and the way back to the source "
-                f"take {needed_ms:.1f} ms of (guard_cycles - 1) periods = {bound_ms:.1f} ms, so "
-                "that the guard fires without a fault; raise it",
+                f"take {needed_ms:.1f} ms, more than {bound_ms:.1f} ms, the guard's patience less "
+                "one period: the guard fires without a fault; raise it",
             )
 
 

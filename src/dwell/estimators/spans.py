@@ -15,10 +15,12 @@ PATIENCE = 2
 def patience_ns(problem: Problem) -> int:
     """Return the age from which an unfinished job or message counts as lost at a window's end.
 
-    The age is `PATIENCE` periods, but at most one period less than the window.
+    The age is `PATIENCE` periods, but at most one period less than the window; D - P more if D is
+    longer than P, because the window then ends later by as much.
     """
-    periods = min(PATIENCE, problem.window_cycles - 1)
-    return round(periods * problem.pipeline.period_ms * NS_PER_MS)
+    pipeline, periods = problem.pipeline, min(PATIENCE, problem.window_cycles - 1)
+    more_ns = max(pipeline.deadline_ns - pipeline.period_ns, 0)
+    return round(periods * pipeline.period_ms * NS_PER_MS) + more_ns
 
 
 def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:

@@ -60,7 +60,7 @@ struct Crossing;  // of meter.cpp
 
 // A window ends `due_ns` after the release of its last cycle, or `grace_ns` after the release of
 // the next cycle, whichever is later. `wakes_ns` is the instant at which the guard is woken unless
-// it learns before that a cycle from `waited` on has completed. `patience_ns` is g periods.
+// it learns before that a cycle from `waited` on has completed. `patience_ns` is the guard's.
 // `decide_cycles` is the number of cycles between decisions that are more frequent than windows; 0
 // for one decision per window. The next decision looks at cycles before `look_cycle`. `since` is
 // the first cycle under the placement in force, and `look_0` the first decision after it.

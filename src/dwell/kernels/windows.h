@@ -147,8 +147,8 @@ void announce_look(S& s, i64 cell) {
 }
 
 // Whether the guard wakes now: it has learnt of no completion from cycle `waited` on, or the cycle
-// after the newest known completion is g periods old. If not, the check is repeated when that cycle
-// is g periods old.
+// after the newest known completion is as old as the patience. If not, the check is repeated when
+// that cycle is.
 template <class S>
 bool wakes_guard(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);

@@ -32,14 +32,13 @@ def _side_by_side(problem: Problem) -> Iterator[Fault]:
 
 def _early_closes(problem: Problem) -> Iterator[Fault]:
     """Yield a `close_grace_ms` that ends before the guard can act on a window's last cycles."""
-    settings = problem.controller
-    patience_ms = settings.guard_cycles * problem.pipeline.period_ms
+    settings, patience_ms = problem.controller, problem.guard_patience_ns / 1e6
+    lost = settings.guard_cycles + problem.pipeline.open_cycles
     if settings.fallbacks and settings.close_grace_ms < patience_ms:
         yield Fault(
             "controller.close_grace_ms",
-            f"{settings.close_grace_ms:g} is less than guard_cycles periods = {patience_ms:g} ms: "
+            f"{settings.close_grace_ms:g} is less than the guard's patience of {patience_ms:g} ms: "
             "a window that closes before the guard acts may bring an order to a placement that the "
             "fault has broken, too, and the guard waits for that one again: up to "
-            f"{2 * settings.guard_cycles + 1} cycles are lost instead of "
-            f"{settings.guard_cycles + 1}",
+            f"{2 * lost - 1} cycles are lost instead of {lost}",
         )

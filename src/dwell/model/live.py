@@ -81,10 +81,10 @@ class LiveSettings:
         usual="the controller's",
     )
     max_age_ms: float | None = key(
-        "Age from which a command is not applied, ms.",
+        "Age from which a command is not applied, ms; at least D.",
         Bound(0, LARGEST, above=True),
         default=None,
-        usual="two periods",
+        usual="max(2 P, D + P)",
     )
     silence: Literal["hold", "zero"] = key(
         "Method of the actuator that is called without commands.", default="hold"
@@ -119,6 +119,18 @@ class LiveSettings:
                 require_callable_name(f"live.actuators.{task}", actuator)
         if self.observer is not None:
             require_callable_name("live.observer", self.observer)
+
+    def require_in_time(self, deadline_ms: float) -> None:
+        """Check that no command within its deadline is too old for the actuator.
+
+        Raises
+        ------
+        ProblemError
+            If `max_age_ms` is given and less than the deadline.
+        """
+        given_ms = self.max_age_ms
+        bound = f"at least deadline_ms = {deadline_ms:g}; raise it, or leave it out"
+        require(given_ms is None or given_ms >= deadline_ms, "live.max_age_ms", given_ms, bound)
 
     def degraded_by(self, rates: Sequence[float]) -> bool:
         """Return whether V_D of the last windows is too high, both on average and in the last.

@@ -18,6 +18,8 @@ from dwell.model.task_rates import rates_of
 WORKERS = Bound(1, MAX_COUNT, whole=True)
 STANDBY = Bound(0, 1, whole=True)
 EVERY = Bound(1, 10_000, whole=True)
+#: Largest deadline, in periods.
+LONGEST_DEADLINE = 64
 
 
 @declared()
@@ -166,7 +168,7 @@ class Pipeline:
     )
     period_ms: float = key("Time between two releases (P), ms.", PERIOD_MS, tier="first")
     deadline_ms: float = key(
-        "Latency beyond which a cycle is missed (D, at most P), ms.",
+        f"Latency beyond which a cycle is missed (D, at most {LONGEST_DEADLINE} P), ms.",
         Bound(1e-6, LARGEST),
         usual="P",
         tier="first",
@@ -194,8 +196,9 @@ class Pipeline:
     )
 
     def __post_init__(self) -> None:
-        bound = f"at most period_ms = {self.period_ms:g}"
-        require(self.deadline_ms <= self.period_ms, "deadline_ms", self.deadline_ms, bound)
+        longest_ms = LONGEST_DEADLINE * self.period_ms
+        bound = f"at most {LONGEST_DEADLINE} period_ms = {longest_ms:g}"
+        require(self.deadline_ms <= longest_ms, "deadline_ms", self.deadline_ms, bound)
         bound = f"less than period_ms = {self.period_ms:g}"
         require(self.first_release_ms < self.period_ms, "phase_ms", self.phase_ms, bound)
         require_names("tasks", self.tasks)
@@ -225,6 +228,11 @@ class Pipeline:
     def deadline_ns(self) -> int:
         """D in whole nanoseconds."""
         return round(self.deadline_ms * 1e6)
+
+    @property
+    def open_cycles(self) -> int:
+        """Largest number of cycles whose deadlines are open: D / P, rounded up; at least 1."""
+        return max(-(-self.deadline_ns // self.period_ns), 1)
 
     def inputs(self, task: str) -> tuple[Flow, ...]:
         """Flows into a task."""

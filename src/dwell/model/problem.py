@@ -86,6 +86,7 @@ class Problem(Displayed):
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
         if self.servo is not None:
             self.servo.require_seen(self.pipeline.period_ms)
+        self.live.require_in_time(self.pipeline.deadline_ms)
         every, width = self.controller.decide_cycles, self.window_cycles
         bound = f"at most window_cycles = {width}; lower decide_cycles, or raise window_cycles"
         require(every is None or every <= width, "controller.decide_cycles", every, bound)
@@ -294,9 +295,17 @@ class Problem(Displayed):
 
     @property
     def max_age_ms(self) -> float:
-        """Largest age of a command that an actuator receives; by default two periods."""
-        given_ms = self.live.max_age_ms
-        return 2 * self.pipeline.period_ms if given_ms is None else given_ms
+        """Largest age of a command that an actuator receives; by default max(2 P, D + P)."""
+        given_ms, pipeline = self.live.max_age_ms, self.pipeline
+        if given_ms is not None:
+            return given_ms
+        return max(2 * pipeline.period_ms, pipeline.deadline_ms + pipeline.period_ms)
+
+    @property
+    def guard_patience_ns(self) -> int:
+        """Longest wait of the guard for a cycle after its release: max(D, P) + (g - 1) P."""
+        pipeline, more = self.pipeline, self.controller.guard_cycles - 1
+        return max(pipeline.deadline_ns, pipeline.period_ns) + more * pipeline.period_ns
 
     @property
     def stamper_node(self) -> str:

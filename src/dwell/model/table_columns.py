@@ -45,6 +45,8 @@ class Column:
         When it is null, or NaN; empty if it never is.
     of : tuple of {"live", "shadows", "support", "fleet", "between"}
         Features of which a run needs at least one to have the column; empty for all runs.
+    is_new : bool
+        Whether a run of this version of the schema may lack it.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Column:
     unit: str = ""
     null: str = ""
     of: tuple[Feature, ...] = ()
+    is_new: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,6 +172,7 @@ WINDOWS = (
         "Float64",
         "Share of these actuations whose age is over `max_age_ms`; 1 without any.",
     ),
+    Column("overtaken", "Int64", "Its cycles that completed after a later cycle.", is_new=True),
     Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
     Column("shadow_bytes", "Int64", "Bytes of shadows on links.", "bytes", of=SHADOWS),
     Column(

@@ -157,7 +157,7 @@ def require_table(table: str, problem: Problem, frame: pl.DataFrame, source: str
     needed = column_types(table, problem)
     for name, column, kind in _columns(table, problem, get_args(Feature)):
         if name not in frame.columns:
-            if name in needed:
+            if name in needed and not column.is_new:
                 raise RunError(f"{source}: lacks the column {name!r}")
             continue
         series, names = frame[name], None if isinstance(kind, str) else kind

@@ -24,9 +24,9 @@ class SimulatedGuard:
     """Passes observations from the kernel's tables to a cell's guard when the kernel wakes it.
 
     The kernel wakes the guard at a set instant if the completion of no cycle from a set cycle on
-    has been received until then; otherwise, when the cycle after the newest completed one is g
-    periods old. The guard never fires before it wakes. It may wake too early, because the kernel
-    does not model its rest. The problem must have fallbacks.
+    has been received until then; otherwise, when the cycle after the newest completed one is as old
+    as the patience. The guard never fires before it wakes. It may wake too early, because the
+    kernel does not model its rest. The problem must have fallbacks.
     """
 
     def __init__(self, problem: Problem, realisation: Realisation, arrays: CellArrays) -> None:
@@ -92,7 +92,7 @@ class SimulatedGuard:
         self._wake_at(min((at for at in instants if at > now), default=LAST_NS))
 
     def _due_ns(self, cycle: int) -> int:
-        """Return the instant at which a cycle is g periods old."""
+        """Return the instant at which a cycle is as old as the guard's patience."""
         if cycle >= self.cycles:
             return LAST_NS
         return min(int(self.release_ns[cycle]) + self.guard.patience_ns, LAST_NS)

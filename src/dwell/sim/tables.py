@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms, moved_shares, seen_costs
+from dwell.control import Controller, final_l95_ms, moved_shares, overtaken_cycles, seen_costs
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
@@ -142,6 +142,12 @@ class PlayedRealisation:
         return share if self.idle is None else windows.sum(axis=1) / self.seen["counted"]
 
     @cached_property
+    def overtaken(self) -> NDArray[np.bool_]:
+        """Whether a later cycle had completed at the completion of each cycle."""
+        latency_ns = self.arrays.tables.latency_ns[0, : self.released]
+        return overtaken_cycles(self.realisation.release_ns[: self.released], latency_ns)
+
+    @cached_property
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: later than D, or unfinished when its window closed."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
@@ -240,6 +246,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
             "cost": seen["cost"],
+            "overtaken": lambda: played.by_window(played.overtaken).sum(axis=1),
             **_shadow_columns(played),
         }
     )

@@ -14,11 +14,13 @@ from dwell.model import (
     Gamma,
     LogNormal,
     Normal,
+    Pipeline,
     Problem,
     Uniform,
     evolve,
 )
 from dwell.model.fleet import Fleet
+from dwell.model.pipeline import LONGEST_DEADLINE
 from dwell.study.capacity import Capacity, capacity_of
 
 #: Extension of deadlines, ms, and speed-up of a resource.
@@ -77,7 +79,7 @@ def changes_of(fleet: Fleet) -> Iterator[SiteChange]:
         yield SiteChange("phases evenly spread", lambda _: fleet.changed(phases="even"))
     cells = [entry.cell for entry in fleet.entries]
     pipelines = [cell.pipeline for cell in cells]
-    if all(one.deadline_ms + LATER_MS <= one.period_ms for one in pipelines):
+    if all(one.deadline_ms + LATER_MS <= _latest_ms(one) for one in pipelines):
         yield SiteChange(f"deadlines {LATER_MS:g} ms later", lambda _: _changed(fleet, _later))
     for name, resource in cells[0].fabric.resources.items():
         if resource.node not in fleet.shared:
@@ -128,6 +130,12 @@ def _under(fleet: Fleet, policy: str, _: int) -> Fleet:
 def _changed(fleet: Fleet, change: Callable[[Problem], Problem]) -> Fleet:
     entries = tuple(replace(entry, cell=change(entry.cell)) for entry in fleet.entries)
     return replace(fleet, entries=entries)
+
+
+def _latest_ms(pipeline: Pipeline) -> float:
+    """Return the latest deadline to try: within the period, unless the deadline is beyond it."""
+    beyond = pipeline.deadline_ms > pipeline.period_ms
+    return pipeline.period_ms * (LONGEST_DEADLINE if beyond else 1)
 
 
 def _later(cell: Problem) -> Problem:

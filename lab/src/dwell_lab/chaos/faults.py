@@ -195,7 +195,7 @@ def bound_of(problem: Problem, fault: Fault, placement: str) -> int | None:
     hit = hit_by(problem, fault)
     if hit is None:
         return None
-    bound = problem.controller.guard_cycles + 1
+    bound = problem.controller.guard_cycles + problem.pipeline.open_cycles
     if not parts_of(problem, placement) & hit:
         return bound
     others = [name for name in problem.controller.fallbacks if name != placement]

@@ -48,11 +48,11 @@ class StateTimes:
             "restore_ms": restore_ms,
             "bytes": len(data),
         }
-        patience_ms = problem.controller.guard_cycles * problem.pipeline.period_ms
+        patience_ms = problem.guard_patience_ns / 1e6
         if snapshot_ms > patience_ms:
             self.warnings.append(
                 f"tasks.{name}.run: snapshot() takes {snapshot_ms:.0f} ms, longer than "
-                f"guard_cycles periods = {patience_ms:g} ms: no checkpoints are made, and a move "
+                f"the guard's patience of {patience_ms:g} ms: no checkpoints are made, and a move "
                 "loses the cycles of that time"
             )
 

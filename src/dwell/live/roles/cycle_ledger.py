@@ -18,7 +18,7 @@ import numpy as np
 from dwell.control import Evidence, Instants
 from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.wire.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Hop, Stamp
+from dwell.live.wire.messages import ACTUATED, BEHIND, NOT_APPLIED, STALE, Completion, Hop, Stamp
 from dwell.live.wire.wiring import lane_of
 from dwell.model import Execution, Problem
 from dwell.model.fabric import accelerator_name
@@ -186,6 +186,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     def came_to(self, *outcomes: str) -> bool:
         """Whether a sink has reported one of these outcomes."""
         return any(done.outcome in outcomes for done in self.reports.values())
+
+    @property
+    def overtaken(self) -> bool:
+        """Whether a sink's gate had passed the command of a later cycle."""
+        return self.came_to(BEHIND)
 
     @property
     def untold(self) -> bool:

@@ -162,7 +162,7 @@ def _symptoms(
 ) -> Iterator[str]:
     """Yield the faults that the cell's cycles show, even if all processes are ready."""
     sinks = [role for role in members if role.kind == "sink"]
-    patience_ms = (problem.controller.guard_cycles + 1) * problem.pipeline.period_ms
+    patience_ms = problem.guard_patience_ns / 1e6 + problem.pipeline.period_ms
     limit_ms = max(patience_ms, problem.max_age_ms)
     slow = list(_slow(problem, status))
     for role in sinks:

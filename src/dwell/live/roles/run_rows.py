@@ -277,6 +277,7 @@ class RunRows:
             "seen_violation_rate": seen_violation_rate,
             **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
             "cost": cost,
+            "overtaken": sum(cycle.overtaken for cycle in cycles),
             "term": cycles[-1].term,
             "lead": window.lead,
             "heard": window.heard,

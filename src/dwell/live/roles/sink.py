@@ -9,7 +9,7 @@ from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.stage import CellActuator, Message
-from dwell.live.wire.messages import ACTUATED, NOT_APPLIED, STALE, Completion, Header
+from dwell.live.wire.messages import ACTUATED, BEHIND, NOT_APPLIED, STALE, Completion, Header
 from dwell.live.wire.payloads import read_payload
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import longest_bytes
@@ -50,7 +50,7 @@ class Sink:
         #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.pulse = Pulse(place, self._state, self._passed, offsets=self.offsets)
-        self.counts = {ACTUATED: 0, NOT_APPLIED: 0, "behind": 0, STALE: 0, "silences": 0}
+        self.counts = {ACTUATED: 0, NOT_APPLIED: 0, BEHIND: 0, STALE: 0, "silences": 0}
         # Errors of the actuator at the last command, and at the last call of `hold` or `zero`.
         self.trouble = self._restless = ""
         self._alarm_ns: int | None = None
@@ -96,7 +96,7 @@ class Sink:
     def _gate(self, header: Header, now_ns: int) -> str:
         cycle = header.stamp.key
         if cycle <= self.newest:
-            return "behind"
+            return BEHIND
         if self.age_ns(header, now_ns) > self.max_age_ns:
             return STALE
         self.newest = cycle

@@ -116,6 +116,7 @@ class Stamper:
         )
         self.intervals = Intervals(place.node, self._sinks)
         self._partial: dict[int, set[str]] = {}
+        self._open = problem.pipeline.open_cycles
         self.shadow_fraction = 0.0
         self.forks: tuple[tuple[str, str], ...] = ()
         self._charge = ""
@@ -234,7 +235,7 @@ class Stamper:
             return
         # A command that the actuator refused counts: the placement has delivered it.
         handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
-        if not handed_over or stamp.cycle < self.guard.newest:
+        if not handed_over or stamp.cycle <= self.guard.newest - self._open:
             return
         sinks = self._partial.setdefault(stamp.cycle, set())
         if done.sink in sinks:

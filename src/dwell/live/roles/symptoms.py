@@ -36,7 +36,8 @@ class Symptoms:
 
     def __init__(self, problem: Problem, ledger: Ledger) -> None:
         self._ledger, self._size = ledger, problem.window_cycles
-        self._guard_cycles = problem.controller.guard_cycles
+        # Cycles that may still complete within the guard's patience.
+        self._open = problem.controller.guard_cycles + problem.pipeline.open_cycles - 1
         self._failures = problem.controller.failures_in_a_row
         self._deadline_ns = problem.pipeline.deadline_ns
         self._period_ns = problem.pipeline.period_ns
@@ -124,7 +125,9 @@ class Symptoms:
         return None if span_ns < window_ns else count * self._period_ns / span_ns
 
     def _is_applied(self, cycle: LiveCycle) -> bool:
-        return cycle.told or (cycle.actuated and self._ledger.complete(cycle))
+        """Whether its command was applied, or was in time and overtaken by a later command."""
+        in_time = cycle.overtaken and not cycle.missed(self._deadline_ns)
+        return cycle.told or ((cycle.actuated or in_time) and self._ledger.complete(cycle))
 
     def _commands(self) -> dict[str, list[Any]]:
         """Return silences, applied commands and cycles of the last windows and of their leads.
@@ -170,11 +173,11 @@ class Symptoms:
         return max(counts, key=counts.__getitem__, default=None)
 
     def _failing(self, newest: Sequence[LiveCycle]) -> Iterator[tuple[str, dict[str, Any]]]:
-        """Yield candidates whose last shadows all failed; the g newest cycles do not count."""
+        """Yield candidates whose last shadows all failed, except within the guard's patience."""
         most = self._failures
         fails: dict[str, list[LiveCycle]] = {}
         succeeded = set()
-        for place, cycle in enumerate(newest[self._guard_cycles :]):
+        for place, cycle in enumerate(newest[self._open :]):
             if not cycle.shadow or cycle.shadow in succeeded:
                 continue
             known = fails.get(cycle.shadow)

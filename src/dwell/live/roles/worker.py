@@ -32,9 +32,10 @@ from dwell.live.wire.routing import STAMPER, Routes
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import EVIDENCE_NS, NEVER_NS
+from dwell.model.pipeline import LONGEST_DEADLINE
 
-#: Largest number of cycles that wait for the rest of their inputs.
-MAX_JOINS = 64
+#: Largest number of cycles that wait for the rest of their inputs: those of the longest deadline.
+MAX_JOINS = LONGEST_DEADLINE
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
 #: Least time between two checkpoints, as a multiple of the cost of a checkpoint.
@@ -96,20 +97,31 @@ class Chore:
 
 @dataclass(slots=True)
 class _Joins:
-    """Inputs of incomplete cycles; when a later cycle is complete, earlier cycles are evicted.
+    """Inputs of incomplete cycles; a complete cycle evicts earlier ones whose deadline has passed.
 
-    `drop` gets the headers of inputs that are too late or evicted.
+    These are `open_cycles` or more before it. `drop` gets the headers of inputs that are too late
+    or evicted.
     """
 
     sources: frozenset[str]
     drop: Callable[[Iterable[Header]], None]
+    open_cycles: int = 1
     waiting: dict[tuple[int, int], Inputs] = field(default_factory=dict)
     newest: tuple[int, int] = (-1, -1)
+    # Complete cycles among the newest `open_cycles`.
+    done: set[tuple[int, int]] = field(default_factory=set)
+
+    @property
+    def _last_over(self) -> tuple[int, int]:
+        """The last cycle whose inputs are too late."""
+        run, number = self.newest
+        return run, number - self.open_cycles
 
     def add(self, header: Header, payload: bytes, at_ns: int) -> Inputs | None:
         """Add an input; return the set of its cycle's inputs if it is now complete."""
         cycle = header.stamp.key
-        if cycle <= self.newest or header.source not in self.sources:
+        late = cycle <= self._last_over or cycle in self.done
+        if late or header.source not in self.sources:
             self.drop([header])
             return None
         inputs = self.waiting.setdefault(cycle, {})
@@ -118,9 +130,11 @@ class _Joins:
             if len(self.waiting) > MAX_JOINS:
                 self._evict(min(self.waiting))
             return None
-        self.newest = cycle
+        self.newest = max(self.newest, cycle)
         del self.waiting[cycle]
-        for other in [other for other in self.waiting if other < cycle]:
+        last = self._last_over
+        self.done = {other for other in (*self.done, cycle) if other > last}
+        for other in [other for other in self.waiting if other <= last]:
             self._evict(other)
         return inputs
 
@@ -228,9 +242,10 @@ class Worker:
         self.book = book or StageBook(problem, task, place.node)
         self.book.begin()
         self._warmup = problem.pipeline.tasks[task].warmup_jobs
+        overlap = problem.pipeline.open_cycles
         self._joins = {
-            MAIN: _Joins(sources, lambda headers: self.book.ended(headers, DROPPED)),
-            SHADOW: _Joins(sources, lambda _: None),
+            MAIN: _Joins(sources, lambda headers: self.book.ended(headers, DROPPED), overlap),
+            SHADOW: _Joins(sources, lambda _: None, overlap),
         }
         #: CPU clock of a job: this thread's, or the process's if the cell file gives the stage
         #: several threads.
@@ -352,7 +367,9 @@ class Worker:
         else:
             self._jobs.append(job)
             if len(self._jobs) > (self._depth or 10 * MAX_JOINS):
-                self._replace(self._jobs.popleft())
+                # Of the oldest waiting job and the new job, the earlier cycle.
+                overtaken = job.order < self._jobs[0].order
+                self._replace(self._jobs.pop() if overtaken else self._jobs.popleft())
 
     def _replace(self, job: Job) -> None:
         """Report a job that a later cycle has replaced."""
@@ -525,7 +542,7 @@ class Worker:
     @property
     def _too_slow(self) -> bool:
         """Whether a checkpoint takes so long that the guard would move the cell."""
-        return self._cost_ns > self.place.patience_ns
+        return self._cost_ns > self.place.problem.guard_patience_ns
 
     def _plan_checkpoint(self, job: Job, now_ns: int) -> None:
         """Plan a checkpoint every `checkpoint_cycles`, if they use at most 1/20 of the time."""

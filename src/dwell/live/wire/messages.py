@@ -21,6 +21,8 @@ MAX_CONTROL_BYTES = 262_144
 ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
 #: Outcome of a command that the gate stops, because it may be older than `max_age_ms`.
 STALE = "stale"
+#: Outcome of a command that the gate stops, because it has passed a later cycle's command.
+BEHIND = "behind"
 #: Start of the refusal of an order while another controller is in charge.
 OTHER = "another controller"
 #: Length of a signature (Ed25519), which precedes the signed bytes.
