@@ -27,8 +27,8 @@ from dwell.control.coordination import Coordination, Verdict, Wish
 from dwell.control.ledger import FleetLedger, Seat
 from dwell.cost import cost_error, price
 from dwell.estimators.load_table import load_table
-from dwell.model import NodeDisturbance, Problem
-from dwell.model.fleet import LIMIT, Fleet, FleetEntry, FleetObjective
+from dwell.model import AIM, NodeDisturbance, Problem
+from dwell.model.fleet import Fleet, FleetEntry, FleetObjective
 from dwell.model.progress import Progress
 from dwell.record.fleet_run import FleetRun
 from dwell.sim import fleet as fleets
@@ -44,7 +44,7 @@ CHANGE, FIRST, LAST, WINDOWS = 20, 30, 59, 60
 #: Instant at which the edge goes, for how long, and the end of a run, seconds.
 GONE_S, AWAY_S, END_S = 60, 8, 120
 #: Limit of V_D with and without tenants, whose bursts alone make a cell miss 5.3 %.
-LIMITS = {"no": LIMIT, "yes": 2 * LIMIT}
+LIMITS = {"no": AIM, "yes": 2 * AIM}
 #: Cells for which the edge server of the canonical cell has its cores.
 CELLS_A_SERVER = 12
 

@@ -35,6 +35,7 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live_cell import document
 from benchmarks.timing import ROOT
 from dwell import __version__
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import (
     Accepted,
@@ -163,7 +164,7 @@ class _Cell:
         every, age = self.problem.decide_cycles, self.cycle - self.first
         if age > 2 * every + 3 and age % every == 3 % every:
             self.silent += 1
-        self._put("stamper@R1", self.keys.stamped(), encode(stamp))
+        self._put("stamper@R1", self.keys.of(channels.STAMPED), encode(stamp))
         return stamp
 
     def complete(self, stamp: Stamp, now_ns: int) -> None:
@@ -174,7 +175,7 @@ class _Cell:
             hops.append(Hop(task, node, at_ns, at_ns, at_ns + 7_000_000, ((before, at_ns),)))
             at_ns, before = at_ns + 7_000_000, task
         done = Completion(stamp, "control", now_ns, "actuated", tuple(hops), "R2")
-        key, payload = self.keys.done("control"), encode(done)
+        key, payload = self.keys.of(channels.DONE, "control"), encode(done)
         self._put("sink.control@R2", key, payload)
         self.gathered.append((key, payload))
         self.sent_done += 1
@@ -184,7 +185,7 @@ class _Cell:
         told, self.gathered = self.gathered, []
         if self.cycle % BEATS == self.number % BEATS:
             told += [self._beat(who, node, now_ns) for who, node in self.everybody]
-        self._put("agent@E", self.keys.gathered(), encode(Carried(tuple(told))))
+        self._put("agent@E", self.keys.of(channels.GATHERED), encode(Carried(tuple(told))))
 
     def _beat(self, who: str, node: str, now_ns: int) -> tuple[str, bytes]:
         before_ns = now_ns - PERIOD_NS
@@ -193,12 +194,12 @@ class _Cell:
             Heard(other, at, before_ns, before_ns + 200_000) for other, at in others if other != who
         )
         beat = Beat(who, node, 1, now_ns, True, heard, cell=self.digest, version=__version__)
-        return self.keys.beat(node, who), encode(beat)
+        return self.keys.of(channels.BEAT, node, who), encode(beat)
 
     def load(self, now_ns: int) -> None:
         """What the CPUs do."""
         for node in self.problem.fabric.nodes:
-            key = self.keys.load(node)
+            key = self.keys.of(channels.LOAD, node)
             payload = encode(Load(node, 1, now_ns, now_ns // 4, now_ns // 8, 0))
             self._put(f"agent@{node}", key, payload)
             self.gathered.append((key, payload))
@@ -221,7 +222,7 @@ class _Cell:
         answer = Accepted(
             *(order.number, order.controller, "", self.run, self.term, self.placement, self.cycle)
         )
-        key, payload = self.keys.accepted(), encode(answer)
+        key, payload = self.keys.of(channels.ACCEPTED), encode(answer)
         self._put("stamper@R1", key, payload)
         self.gathered.append((key, payload))
 

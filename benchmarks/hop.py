@@ -22,6 +22,7 @@ from benchmarks.live_cell import document, problem_of
 from benchmarks.timing import ROOT
 from dwell.live.stage import Message
 from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wire import channels
 from dwell.live.wire.keys import MAIN, Keys
 from dwell.live.wire.messages import Header, Stamp, decode, encode
 from dwell.live.wire.routing import STAMPER
@@ -61,11 +62,11 @@ class Hops:
     """Stamps cycles, and hears of them."""
 
     def __init__(self, stamper: ZenohTransport, last: ZenohTransport, keys: Keys) -> None:
-        self._stamper, self._key = stamper, keys.inputs("first", "R1", MAIN)
+        self._stamper, self._key = stamper, keys.of(channels.INPUT, "first", "R1", MAIN)
         self._cycle = 0
         self._latency_ns = 0
         self._answered = threading.Event()
-        last.subscribe(keys.inputs("last", "R1", MAIN), self._arrived)
+        last.subscribe(keys.of(channels.INPUT, "last", "R1", MAIN), self._arrived)
 
     def _arrived(self, sample: Arrival) -> None:
         header = decode(sample.header, Header)

@@ -13,8 +13,9 @@ from pathlib import Path
 from benchmarks.figures import Figure, Goal, Section
 from dwell.live.local.linked_transport import LinkedTransport
 from dwell.live.local.message_links import LinkEnds, LinkFile
-from dwell.live.wire.transport import Arrival, Lane, Receive
+from dwell.live.wire.transport import Arrival
 from dwell.model import Constant
+from tests.live.direct_transport import DirectTransport
 
 NODES = ("R1", "E")
 SIZES = {"200 bytes": 200, "300 kB": 300_000}
@@ -22,25 +23,6 @@ SIZES = {"200 bytes": 200, "300 kB": 300_000}
 KEYS = {"at the sender": "dwell/cell/in/perception/E/work", "at the receiver": "dwell/cell/stamped"}
 DELAY_MS, HERTZ = 25.0, 200
 LATE_MS, ADDED_MS = 0.3, 0.1
-
-
-class _Carrier:
-    """Hands a message to whoever has subscribed, at once."""
-
-    def __init__(self) -> None:
-        self.receivers: list[Receive] = []
-
-    def put(
-        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
-    ) -> None:
-        for receive in self.receivers:
-            receive(Arrival(key, bytes(payload), header))
-
-    def subscribe(self, key: str, receive: Receive) -> None:
-        self.receivers.append(receive)
-
-    def close(self) -> None:
-        self.receivers.clear()
 
 
 def measure(quick: bool) -> Section:
@@ -64,7 +46,7 @@ def measure(quick: bool) -> Section:
 @contextmanager
 def _pair() -> Iterator[tuple[LinkFile, LinkedTransport, LinkedTransport]]:
     with tempfile.TemporaryDirectory() as folder:
-        carrier = _Carrier()
+        carrier = DirectTransport()
         with closing(LinkFile(Path(folder) / "links", NODES, seed=1)) as file:
             sender = LinkedTransport(carrier, LinkEnds(file.path, "camera@R1", "R1"))
             receiver = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
@@ -84,7 +66,7 @@ def _added_ms(key: str, size: int, count: int) -> float:
             sender.put(key, payload)
     pairs = zip(begun, times, strict=True)
     through = statistics.median(end - begin for begin, end in pairs)
-    carrier, times = _Carrier(), []
+    carrier, times = DirectTransport(), []
     carrier.subscribe("**", lambda sample: times.append(time.perf_counter_ns()))
     begun = []
     for _ in range(count):

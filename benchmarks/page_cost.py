@@ -18,6 +18,7 @@ from benchmarks.live import cell_of, cpu_s, processes_of
 from benchmarks.live_cell import LightCell, document
 from benchmarks.page import CHROMIUM, browser_of
 from dwell.live.host.security import Security
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role
@@ -114,7 +115,7 @@ def _heard(cell: LightCell, seconds: float) -> tuple[float, float]:
     security = Security.of(problem, Role("counts", problem.controller_node, "visitor"))
     relay = f"agent@{problem.relay_node}"
     transport = security.visit("counts", f"stamper@{problem.stamper_node}", relay)
-    for key in (Keys(problem.name).stamped(), Keys(problem.name).gathered()):
+    for key in (Keys(problem.name).of(channels.STAMPED), Keys(problem.name).of(channels.GATHERED)):
         transport.subscribe(key, count)
     time.sleep(1)
     lengths.clear()

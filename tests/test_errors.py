@@ -19,6 +19,8 @@ from dwell.errors import (
     PolicyError,
     ProblemError,
     TraceError,
+    installing,
+    lacking,
     line_and_code,
     missing_package,
 )
@@ -98,3 +100,12 @@ def test_a_module_of_a_user_that_is_missing_has_no_line() -> None:
     known = line_and_code(ModuleNotFoundError(name="zenoh"))
     assert known is not None
     assert known[1] == ExitCode.FAILED
+
+
+def test_missing_packages_are_named_with_the_command_that_installs_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("dwell.errors.OPTIONAL", {"no_such": ("A", "x"), "nor_this": ("B", "y")})
+    assert lacking("x") == f"A is not installed; {installing('x')}"
+    assert lacking("x", "y") == f"A and B are not installed; {installing('y')}"
+    assert lacking("z") == ""

@@ -33,6 +33,7 @@ __all__ = [
     "UserNote",
     "describe_raised",
     "installing",
+    "lacking",
     "line_and_code",
     "missing_package",
     "not_installed",
@@ -236,6 +237,17 @@ def not_installed(*extras: str) -> list[str]:
         for module, (package, extra) in OPTIONAL.items()
         if extra in extras and find_spec(module) is None
     ]
+
+
+def lacking(*extras: str) -> str:
+    """Return which packages of some extras are not installed, and the command that installs them.
+
+    The last extra contains the others. Returns an empty string if all are installed.
+    """
+    packages = not_installed(*extras)
+    verb = "is" if len(packages) == 1 else "are"
+    what = f"{' and '.join(packages)} {verb} not installed"
+    return f"{what}; {installing(extras[-1])}" if packages else ""
 
 
 def missing_package(error: ModuleNotFoundError) -> DwellError | None:

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -124,7 +125,8 @@ def test_equal_placements_are_in_the_order_of_nodes() -> None:
         for name, task in problem.pipeline.tasks.items()
     }
     pipeline = replace(problem.pipeline, tasks=flat)
-    nodes = problem.fabric.nodes | {"P3": replace(problem.fabric.nodes["P3"], background=0.1)}
+    third = replace(problem.fabric.nodes["P3"], background=0.1)
+    nodes = {**problem.fabric.nodes, "P3": third}
     fabric = replace(problem.fabric, nodes=nodes)
     # P1 and P2 are equal, so only one of two mirrored placements is simulated.
     ranking = rank(replace(problem, pipeline=pipeline, fabric=fabric), cycles=5, top=3)
@@ -202,7 +204,7 @@ def test_more_cycles_tell_placements_apart_or_end_in_a_tie() -> None:
         ({"cycles": True}, "cycles is True"),
     ],
 )
-def test_numbers_out_of_range_are_refused(given: dict[str, int], words: str) -> None:
+def test_numbers_out_of_range_are_refused(given: dict[str, Any], words: str) -> None:
     with pytest.raises(SimulationError, match=words):
         dwell.search(heft_graph(), **given)
 

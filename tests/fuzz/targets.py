@@ -26,8 +26,9 @@ from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.roster import Roster
 from dwell.live.trust.signing import Seals
-from dwell.live.wire import messages
-from dwell.live.wire.keys import RELAYED, Keys
+from dwell.live.wire import channels, messages
+from dwell.live.wire.channels import CHANNELS, RELAYED
+from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
     Beat,
@@ -39,6 +40,7 @@ from dwell.live.wire.messages import (
 )
 from dwell.live.wire.payloads import read_payload
 from dwell.live.wire.transport import Arrival
+from dwell.model import Problem
 from tests.cells.once import with_windows
 from tests.live.small_world import Bench, Passing, World, forget_jobs
 
@@ -103,25 +105,21 @@ def _world(*, keys: bool) -> World:
     return found
 
 
-@cache
-def _keys() -> tuple[str, ...]:
-    keys = Keys(dwell.load("examples/canonical.yaml").name)
+def every_key(problem: Problem) -> tuple[str, ...]:
+    """Return the keys of all messages of a cell, and of their copies on the detour."""
+    keys = Keys(problem.name)
     plain = [
-        *(keys.inputs(task, node, kind) for task, node, kind in _inputs()),
-        *(keys.command("control"), keys.done("control"), keys.ended(), keys.stamped()),
-        *(keys.frame(), keys.order(), keys.accepted(), keys.load("E"), keys.restored()),
-        *(keys.beat("R1", "stamper@R1"), keys.beat("E", "agent@E"), keys.snapshot("planning", "E")),
-        *(keys.beats("E"), keys.missed()),
-        *(keys.state("planning", "E"), keys.ask(), keys.look(), keys.carried(), keys.gathered()),
+        keys.of(channel, *chunks)
+        for channel in CHANNELS.values()
+        for chunks in dict(channel.senders(problem)) or [()]
+        if "*" not in chunks
     ]
     return *plain, *(keys.detour(key) for key in plain), *(keys.relay(key) for key in plain)
 
 
-def _inputs() -> list[tuple[str, str, str]]:
-    return [
-        *(("sensing", "R1", "main"), ("perception", "E", "main"), ("perception", "R1", "shadow")),
-        *(("planning", "E", "main"), ("control", "R2", "main"), ("control", "R2", "shadow")),
-    ]
+@cache
+def _keys() -> tuple[str, ...]:
+    return every_key(dwell.load("examples/canonical.yaml"))
 
 
 # ---------------------------------------------------------------------------- the targets
@@ -161,8 +159,8 @@ def read_any_payload(data: bytes) -> None:
 def read_bundle(data: bytes) -> None:
     """As it comes over the detour."""
     place = _world(keys=False).stamper.place
-    for sample in place.around(Arrival(place.keys.carried(), data)):
-        assert place.keys.word(sample.key) in RELAYED
+    for sample in place.around(Arrival(place.keys.of(channels.CARRIED), data)):
+        assert place.channel(sample) in RELAYED
         assert len(sample.payload) <= len(data)
 
 
@@ -272,9 +270,9 @@ def _next_messages(world: World, cell: ControlledCell) -> list[tuple[str, msgspe
         stamper.cycle,
     )
     return [
-        (keys.stamped(), messages.Stamped(*who, now_ns)),
-        (keys.done("control"), done),
-        (keys.accepted(), messages.Accepted(*told)),
+        (keys.of(channels.STAMPED), messages.Stamped(*who, now_ns)),
+        (keys.of(channels.DONE, "control"), done),
+        (keys.of(channels.ACCEPTED), messages.Accepted(*told)),
     ]
 
 

@@ -14,15 +14,18 @@ from dwell.live.host.agent import Agent
 from dwell.live.host.supervision import Supervisor
 from dwell.live.roles import role as role_module
 from dwell.live.roles.controlled_cell import ControlledCell, Recorder
+from dwell.live.roles.joins import Job
 from dwell.live.roles.recording import RunRecorder
 from dwell.live.roles.role import RolePlace
 from dwell.live.roles.run_rows import Resume, Rows, columns_of
 from dwell.live.roles.sink import Sink
 from dwell.live.roles.stage_counts import StageBook
 from dwell.live.roles.stamper import Stamper, StamperState
-from dwell.live.roles.worker import Chore, Job, Worker
+from dwell.live.roles.state_transfer import Chore
+from dwell.live.roles.worker import Worker
 from dwell.live.stage import CellActuator, CellStage, Message
 from dwell.live.trust.signing import Seals
+from dwell.live.wire import channels
 from dwell.live.wire.keys import CONTROLLER, Keys
 from dwell.live.wire.messages import Accepted, Ask, Order, StageCounts, decode, encode
 from dwell.live.wire.transport import Arrival
@@ -186,7 +189,7 @@ class MemoryRecorder:
 def queued(worker: Worker) -> tuple[int, int, list[int]]:
     """Return how many jobs, jobs of shadows, and inputs per join wait at a worker."""
     joins = [len(joins.waiting) for joins in worker._joins.values()]
-    return len(worker._jobs), len(worker._forked), joins
+    return len(worker._jobs), len(worker.transfer.forked), joins
 
 
 def forget_jobs(worker: Worker) -> bool:
@@ -432,7 +435,7 @@ class World:
 
     def sample(self, order: Order) -> Arrival:
         """An order as it arrives."""
-        return Arrival(self.keys.order(), encode(order))
+        return Arrival(self.keys.of(channels.ORDER), encode(order))
 
     def order(self, placement: str, *, run: int = 0, term: int = 0, controller: str = "me") -> str:
         """Order a placement; returns why it was refused, or nothing."""
@@ -446,7 +449,7 @@ class World:
         answers: list[bytes] = []
 
         def hear(sample: Arrival) -> None:
-            if sample.key == self.keys.accepted():
+            if sample.key == self.keys.of(channels.ACCEPTED):
                 answers.append(sample.payload)
 
         self.network.taps.append(hear)
@@ -469,7 +472,7 @@ class World:
 
     def ask(self, what: str, about: str = "") -> None:
         """Ask the controller as a person does."""
-        self.tell(self.keys.ask(), encode(Ask("me", what, about)))
+        self.tell(self.keys.of(channels.ASK), encode(Ask("me", what, about)))
 
     def tell(self, key: str, data: bytes) -> int:
         """Hand the controller a message; returns how many it complains of."""

@@ -13,8 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dwell.live.roles.worker import Chore
+from dwell.live.roles.state_transfer import Chore
 from dwell.live.stage import Message
+from dwell.live.wire import channels
 from dwell.live.wire.messages import Completion, Order, Stamp, State, encode
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
@@ -268,7 +269,7 @@ def test_rule_5_a_cycle_of_the_placement_before_says_nothing_of_this_one(problem
     for placement, carries in (("SO", False), (stamper.placement, True)):
         stamp = Stamp(stamper.run, cycle, stamper.term, placement, world.network.now_ns)
         done = Completion(stamp, "control", world.network.now_ns, "actuated", (), "R2")
-        arrival = Arrival(world.keys.done("control"), encode(done))
+        arrival = Arrival(world.keys.of(channels.DONE, "control"), encode(done))
         stamper._partial.clear()
         stamper.receive(arrival, world.network.now_ns)
         assert stamper.guard.carries == carries
@@ -520,7 +521,7 @@ def test_rule_8_a_state_is_whole_after_a_migration_that_was_given_up(problem: Pr
     world.run(1_000)
     world.pin("SO")
     target = world.worker("planning@E")
-    while target.state_at < (0, 0):
+    while target.transfer.at < (0, 0):
         world.run(1)
     # It has the state, and follows; who would order the placement is gone.
     world.kill("controller@E")
@@ -538,9 +539,9 @@ def test_rule_8_a_state_that_comes_too_late_replaces_nothing(problem: Problem) -
     world = counting(problem, "SO")
     world.run(1_000)
     worker = world.worker("planning@E")
-    run, cycle = worker.state_at
+    run, cycle = worker.transfer.at
     late = State(run, cycle - 5, "planning", "R2", number=7)
-    key = world.stamper.place.keys.state("planning", "E", "R2")
+    key = world.stamper.place.keys.of(channels.STATE, "planning", "E", "R2")
     worker.receive(Arrival(key, b"3", encode(late)), world.network.now_ns)
     world.run(1_000)
     require_whole(world)
@@ -556,7 +557,9 @@ def false_state(world: World, to: str, source: str, ahead: int, number: int) -> 
     """Have a node send a state that nobody has asked it for, of a cycle so far ahead."""
     stamper = world.stamper
     state = State(stamper.run, stamper.cycle + ahead, "planning", source, number)
-    arrival = Arrival(world.keys.state("planning", to, source), b"1000000", encode(state))
+    arrival = Arrival(
+        world.keys.of(channels.STATE, "planning", to, source), b"1000000", encode(state)
+    )
     world.worker(f"planning@{to}").receive(arrival, world.network.now_ns)
 
 
@@ -587,9 +590,9 @@ def test_rule_8_a_state_is_of_who_was_asked_and_of_no_cycle_beyond_the_newest(
     world.run(1_000)
     world.pin("SO")
     target = world.worker("planning@E")
-    while target._awaited is None:
+    while target.transfer.awaited is None:
         world.run(1)
-    false_state(world, "E", source, ahead, target._awaited.number)
+    false_state(world, "E", source, ahead, target.transfer.awaited.number)
     world.run(3_000)
     assert world.stamper.placement == "SO"
     require_whole(world)
@@ -606,7 +609,7 @@ def test_rule_8_no_false_checkpoint_keeps_a_good_one_from_being_used(
     state = State(stamper.run + run, stamper.cycle + ahead, "planning", "E")
     if (run, ahead) == (0, -1):
         state = msgspec.structs.replace(state, node="R1")
-    key = world.keys.state("planning", "R2", "E")
+    key = world.keys.of(channels.STATE, "planning", "R2", "E")
     world.worker("planning@R2").receive(
         Arrival(key, b"1000000", encode(state)), world.network.now_ns
     )
@@ -622,7 +625,7 @@ def test_rule_8_a_checkpoint_of_a_cycle_to_come_is_not_used(problem: Problem) ->
     world = counting(problem, "SO")
     world.run(3_000)
     state = State(world.stamper.run, world.stamper.cycle + 1_000, "planning", "E")
-    key = world.keys.state("planning", "R2", "E")
+    key = world.keys.of(channels.STATE, "planning", "R2", "E")
     world.worker("planning@R2").receive(
         Arrival(key, b"1000000", encode(state)), world.network.now_ns
     )

@@ -13,9 +13,10 @@ import pytest
 
 import dwell
 from dwell.live.host.agent import Agent
+from dwell.live.roles.joins import MAX_JOINS
 from dwell.live.roles.loads import MOST_PROCESSES, ProcessLoads
 from dwell.live.roles.role import MAX_COMPLAINTS
-from dwell.live.roles.worker import MAX_JOINS
+from dwell.live.wire import channels
 from dwell.live.wire.messages import MAX_CONTROL_BYTES, Carried, Stamped, decode, encode
 from dwell.live.wire.relay_batch import LONGEST_MESSAGE, MOST_MESSAGES, RelayBatch
 from dwell.live.wire.transport import Arrival
@@ -131,7 +132,7 @@ def test_who_floods_the_relay_does_not_silence_the_detour(key: str, payload: byt
     keys = relay.place.keys
     ear = network.transport("ear@E", "E")
     network.reach = None
-    for one in (keys.carried(), keys.gathered()):
+    for one in (keys.of(channels.CARRIED), keys.of(channels.GATHERED)):
         ear.subscribe(one, lambda sample: bundles.append((sample.key, sample.payload)))
 
     def flood() -> None:
@@ -185,7 +186,7 @@ def test_the_controller_believes_no_placement_that_is_no_candidate() -> None:
     course = copy.copy(controller.course)
     stamp = Stamped(course.run, 99, course.term + 5, "none", 0)
     controller.receive(
-        Arrival(controller.place.keys.stamped(), encode(stamp)), world.network.now_ns
+        Arrival(controller.place.keys.of(channels.STAMPED), encode(stamp)), world.network.now_ns
     )
     assert controller.course == course
     assert "'none' holds, which is no candidate" in controller.place.last_complaint

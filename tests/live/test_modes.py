@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import pytest
 
+from dwell.live.wire import channels
 from dwell.live.wire.messages import Ask, encode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
@@ -23,7 +24,7 @@ def problem() -> Problem:
 def ask(world: World, what: str, about: str = "") -> str:
     """Ask as a person does; returns the refusal."""
     cell = world.cell
-    sample = Arrival(world.keys.ask(), encode(Ask("me", what, about)))
+    sample = Arrival(world.keys.of(channels.ASK), encode(Ask("me", what, about)))
     before = cell._do(Ask("me", what, about), world.network.now_ns)
     cell.receive(sample, world.network.now_ns)
     return before

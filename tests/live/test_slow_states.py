@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dwell.live.wire import channels
 from dwell.model import Problem
 from tests.live.memory_transport import NetworkConditions
 from tests.live.small_world import MS, Bench, Counting, World, canonical, on, stateful
@@ -154,7 +155,7 @@ def test_checkpoints_take_at_most_a_20th_of_the_time(problem: Problem) -> None:
     cost_ms = 1.5 * problem.pipeline.period_ms
     slow(world, "planning@E", "snapshot()", cost_ms)
     world.run(1_000)
-    state = world.keys.state("planning", "R2", "E")
+    state = world.keys.of(channels.STATE, "planning", "R2", "E")
     world.network.taps.append(
         lambda sample: sent.append(world.network.now_ns) if sample.key == state else None
     )

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from dwell.cellfile import from_document
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import (
     Accepted,
@@ -42,12 +43,14 @@ class Wire:
         return Keys(self.judge.problem.name)
 
     def stamp(self, cycle: int, term: int, placement: str, run: int = RUN) -> list[str]:
-        return self.say(self.keys.stamped(), encode(Stamped(run, cycle, term, placement, 0)))
+        return self.say(
+            self.keys.of(channels.STAMPED), encode(Stamped(run, cycle, term, placement, 0))
+        )
 
     def order(self, term: int, placement: str) -> Order:
         self.number += 1
         order = Order(self.number, "controller-1", RUN, term, placement)
-        assert self.say(self.keys.order(), encode(order)) == []
+        assert self.say(self.keys.of(channels.ORDER), encode(order)) == []
         return order
 
     def accept(
@@ -56,11 +59,11 @@ class Wire:
         answer = Accepted(
             *(order.number, order.controller, "", RUN, term, placement, cycle), fallback=fallback
         )
-        return self.say(self.keys.accepted(), encode(answer))
+        return self.say(self.keys.of(channels.ACCEPTED), encode(answer))
 
     def route(self, task: str, node: str, stamp: Stamp, kind: str = "main") -> list[str]:
         header = encode(Header(stamp, "stamper", "R1", "none"))
-        return self.say(self.keys.inputs(task, node, kind), header=header)
+        return self.say(self.keys.of(channels.INPUT, task, node, kind), header=header)
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +116,7 @@ def test_an_answer_that_is_heard_before_its_order_is_held_against_it(wire: Wire)
     wire.stamp(0, 1, "SO")
     order = Order(1, "controller-1", RUN, 1, "HYB")
     assert wire.accept(order, 3, "HYB", 1) == []
-    assert "accepted in term 3" in "; ".join(wire.say(wire.keys.order(), encode(order)))
+    assert "accepted in term 3" in "; ".join(wire.say(wire.keys.of(channels.ORDER), encode(order)))
 
 
 def test_an_order_that_was_accepted_before_the_guard_moved_may_be_answered_again(
@@ -151,7 +154,7 @@ def test_routes(wire: Wire, task: str, node: str, stamp: Stamp, kind: str, wrong
 def test_jobs_run_where_the_stamp_says(wire: Wire) -> None:
     hops = (Hop("perception", "R1", 0, 0, 0),)
     done = Completion(Stamp(RUN, 1, 1, "SO", 0), "control", 0, "actuated", hops, "R2")
-    assert "ran on R1" in "; ".join(wire.say(wire.keys.done("control"), encode(done)))
+    assert "ran on R1" in "; ".join(wire.say(wire.keys.of(channels.DONE, "control"), encode(done)))
 
 
 @pytest.mark.parametrize(
@@ -182,7 +185,7 @@ def test_no_status_is_ok_while_the_actuator_lacks_commands(
 
 
 def test_what_cannot_be_decoded_is_wrong(wire: Wire) -> None:
-    assert wire.say(wire.keys.stamped(), b"\xff")
+    assert wire.say(wire.keys.of(channels.STAMPED), b"\xff")
 
 
 @pytest.mark.parametrize("early", [True, False])

@@ -26,8 +26,9 @@ from dwell.live.host.security import Security
 from dwell.live.log import printable
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle
 from dwell.live.roles.role import Pulse
+from dwell.live.wire import channels
 from dwell.live.wire.local_addresses import running_elsewhere
-from dwell.live.wire.messages import Accepted, Stamped, decode
+from dwell.live.wire.messages import Stamped
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role
 from dwell.model import Problem
@@ -220,7 +221,7 @@ class Observer:
         """Request the status once, then subscribe and start the thread of requests."""
         self._look()
         keys = self._place.keys
-        for key in (keys.stamped(), keys.gathered()):
+        for key in (keys.of(channels.STAMPED), keys.of(channels.GATHERED)):
             self._transport.subscribe(key, self._heard)
         start_thread("asks", self._ask_on)
         return self
@@ -281,24 +282,24 @@ class Observer:
 
     def _take(self, sample: Arrival) -> None:
         place = self._place
-        match place.keys.word(sample.key):
-            case "gathered":
+        match place.channel(sample):
+            case channels.GATHERED:
                 self._told_ns = time.monotonic_ns()
                 for arrival in place.around(sample):
                     self._take(arrival)
-            case "stamped":
-                self._stamped(decode(sample.payload, Stamped))
-            case "beat" | "beats":
+            case channels.STAMPED:
+                self._stamped(place.read(channels.STAMPED, sample))
+            case channels.BEAT | channels.BEATS:
                 for beat, _, _ in self._pulse.receive(sample, time.time_ns()):
                     for heard in beat.heard:
                         self._offsets.sample(heard.node, beat.node, heard.beat_ns, heard.at_ns)
-            case "done" | "ended":
+            case channels.DONE | channels.ENDED:
                 done = place.completion(sample)
                 cycle = self._open.get(done.stamp.key)
                 if cycle is not None and self._ledger.tells(done):
                     cycle.take(done, None)
-            case "accepted":
-                place.read(sample, Accepted, lambda _: place.stamper[0])
+            case channels.ACCEPTED:
+                place.read(channels.ACCEPTED, sample)
 
     def _stamped(self, stamp: Stamped) -> None:
         before = None if self._newest is None else self._newest[0]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
+from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.slow_processes import mean_and_error
 from dwell.kernels.advance import play
-from dwell.kernels.arrays import lay_out, ordered_flows
+from dwell.kernels.arrays import ordered_flows
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model.frozen import FrozenDict
@@ -51,22 +50,20 @@ class AnyPlacement:
         self.problem = problem
         drawing = Drawing(problem, scenario, seed=seed, windows=windows, wraps=True, every_hop=True)
         self.realisation: Realisation = drawing.take(windows)
-        self._first = lay_out([(problem, self.realisation)]).copy()
-        self._arrays = self._first.copy()
+        self._player = CandidatePlayer([(problem, self.realisation)])
+        # The placement replaces the first candidate, which all cycles use.
+        self._arrays = self._player.tables({0: next(iter(problem.candidates))})
         self._sites = {site: row for row, site in enumerate(self.realisation.sites)}
         self._hops = {hop: row for row, hop in enumerate(self.realisation.hops)}
         self._flows = ordered_flows(problem.pipeline)
         tables = self._arrays.tables
         self._site_of, self._route = tables.site_of[:1].copy(), tables.route[:1].copy()
-        # The placement replaces the first candidate, which all cycles use.
-        self._arrays.replace(
-            site_of=self._site_of, route=self._route, stamps=np.zeros_like(tables.stamps)
-        )
+        self._arrays.replace(site_of=self._site_of, route=self._route)
 
     def measure(self, placement: Mapping[str, str]) -> Measured:
         """Simulate a placement of all tasks, whose flows have links."""
         arrays = self._arrays
-        arrays.restart(self._first)
+        arrays.restart(self._player.first)
         self._site_of[0] = [
             self._sites[task, placement[task]] for task in self.problem.pipeline.tasks
         ]
@@ -74,11 +71,10 @@ class AnyPlacement:
             link = f"{placement[flow.source]}->{placement[flow.target]}"
             self._route[0, column] = self._hops.get((flow.source, flow.target, link), -1)
         play(arrays)
-        tables = arrays.tables  # read after `play`: a table that grows is replaced
-        seen, used = tables.seen[0], tables.shares[0, :, 0].mean(axis=0)
-        resources = self.problem.fabric.resources
+        windows, resources = self._player.windows(arrays), self.problem.fabric.resources
+        used = windows.shares[:, 0].mean(axis=0)
         return Measured(
-            l95_ms=seen["l95_ms"].copy(),
-            violation_rate=seen["missed"] / self.problem.window_cycles,
+            l95_ms=windows.l95_ms.copy(),
+            violation_rate=windows.violation_rate,
             utilisation=FrozenDict(zip(resources, used.round(12).tolist(), strict=True)),
         )

@@ -128,7 +128,7 @@ def run_timeline(
         "nodes": _used(windows, begin_s + length_s / 2, resources, each),
     }
     wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
-    aim, due = limit_rule("y", 100 * AIM, "5 %"), limit_rule("y", deadline_ms, "deadline")
+    aim, due = _aim(AIM), limit_rule("y", deadline_ms, "deadline")
     used = set(frame["placement"])
     colours = {name: colour for name, colour in placements.items() if name in used}
     rates = _marks("v_d", RATE.heading, colours, each, _range_of(frame["v_d"], 0.0, 100 * AIM))
@@ -158,6 +158,11 @@ def _range_of(values: pl.Series, *also: float) -> list[float]:
     low, high = (min(found), max(found)) if found else (0.0, 1.0)
     room = 0.04 * (high - low) or 0.04 * abs(high) or 1.0
     return [max(low - room, 0.0) if low >= 0 else low - room, high + room]
+
+
+def _aim(share: float) -> list[Spec]:
+    """Return the layer with the line of the aim for V_D."""
+    return limit_rule("y", 100 * share, f"{100 * share:g} %")
 
 
 def rows_px(cells: int) -> float:
@@ -221,10 +226,9 @@ def fleet_timeline(
     windows = run.cells[first].windows
     begin_s = begins_by_number(windows, problems[first].pipeline.period_ms)
     frames["spans"] = _spans(windows, disturbed, begin_s, step_s, end_s)
-    aim = 100 * run.fleet.aim
     panels: list[tuple[float, list[Spec]]] = [
         (rows_px(len(cells)), [_placed(cells, colours)]),
-        (PANEL_PX, [*limit_rule("y", aim, f"{aim:g} %"), *_rates()]),
+        (PANEL_PX, [*_aim(run.fleet.aim), *_rates()]),
     ]
     if resources:
         panels.append((USE_PX, _use(resources, each)))

@@ -43,14 +43,14 @@ class StaticCell(NamedTuple):
     problem : Problem
     drawn, real : Realisation
         Complete windows, and the cycles that are released before the end of the run.
-    candidate : int
+    stamp : int
         Index of the candidate.
     """
 
     problem: Problem
     drawn: Realisation
     real: Realisation
-    candidate: int
+    stamp: int
 
 
 class StaticFleet:
@@ -79,19 +79,21 @@ class StaticFleet:
         largest = sizes[-1]
         whole = _lay_out(fleets[-1], largest)
         row_of = {id(cell): row for row, cell in enumerate(largest)}
-        for fleet, cells in zip(fleets, sizes, strict=True):
+        for fleet, cells in zip(fleets[:-1], sizes, strict=False):
             rows = [row_of.get(id(cell), -1) for cell in cells]
             # The first cell defines the shared nodes.
             if rows[0] == 0 and rows == sorted(rows):
-                yield _result(fleet, cells, whole, rows)
+                part = whole.copy()
+                part.leave_out(set(row_of.values()).difference(rows))
+                yield _result(fleet, cells, part, rows)
             else:
                 yield _result(fleet, cells, _lay_out(fleet, cells), range(len(cells)))
+        yield _result(fleets[-1], largest, whole, range(len(largest)))
 
     def waiting(self, fleet: Fleet) -> Waiting:
         """Return the waiting times of the missed cycles of all cells."""
         cells, waited = self._cells(fleet), Waiting()
         whole = _lay_out(fleet, cells, jobs=True)
-        whole = whole.on({i: cell.candidate for i, cell in enumerate(cells)})
         play(whole)
         for i, cell in enumerate(cells):
             waited += waiting_of(cell.problem, cell.real, CellArrays(whole, i))
@@ -126,14 +128,15 @@ class StaticFleet:
 
 def _lay_out(fleet: Fleet, cells: Sequence[StaticCell], *, jobs: bool = False) -> Arrays:
     pairs = [(cell.problem, cell.real) for cell in cells]
-    return lay_out(pairs, shared=fleet.shared, log_jobs=jobs)
+    arrays = lay_out(pairs, shared=fleet.shared, log_jobs=jobs)
+    arrays.tables.stamps[:] = np.array([cell.stamp for cell in cells])[:, None]
+    return arrays
 
 
 def _result(
-    fleet: Fleet, cells: Sequence[StaticCell], whole: Arrays, rows: Sequence[int]
+    fleet: Fleet, cells: Sequence[StaticCell], arrays: Arrays, rows: Sequence[int]
 ) -> StaticRun:
     """Simulate the cells, which are in some rows of the tables."""
-    arrays = whole.on({row: cell.candidate for row, cell in zip(rows, cells, strict=True)})
     play(arrays)
     missed: list[NDArray[np.bool_]] = []
     used: dict[str, float] = {}

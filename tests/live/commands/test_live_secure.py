@@ -20,6 +20,7 @@ import pytest
 
 import dwell
 from dwell.live.host.security import INSECURE, Security, environment
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import Order, Stamped, encode
 from dwell.live.wire.wiring import Role, wire
@@ -192,7 +193,7 @@ def test_orders_of_others_move_nothing(cell: SecureCell) -> None:
     status = cell.until(lambda status: status["placement"] == "SO")
     stamper = wire(cell.problem).entry("stamper@R1").listen["control"]
     order = encode(Order(1 << 60, "me", status["run"], status["term"], "LOC"))
-    key = Keys(cell.problem.name).order()
+    key = Keys(cell.problem.name).of(channels.ORDER)
     for name, gets_through in (("R2", False), ("controller", True)):
         with Intruder(stamper.port, tls(cell.host / name)) as intruder:
             limit_s = time.monotonic() + PATIENCE_S
@@ -223,7 +224,7 @@ def test_false_stamps_with_the_stampers_keys_end_no_decisions(cell: SecureCell) 
             limit_s = time.monotonic() + PATIENCE_S
             heard = 0
             while heard < number and time.monotonic() < limit_s:
-                intruder.put(Keys(cell.problem.name).stamped(), encode(message))
+                intruder.put(Keys(cell.problem.name).of(channels.STAMPED), encode(message))
                 time.sleep(0.2)
                 heard = cell.until(lambda _: True)["disbelieved"]
             assert heard >= number

@@ -50,7 +50,7 @@ def test_each_process_has_its_command_its_log_and_its_session(
     processes.start_agent("R1")
     processes.start_controller_on("E", tmp_path / "runs", ["--policy", "LOC"])
     file, state = tmp_path / "cell.yaml", tmp_path / "logs" / "R1"
-    agent = ["-m", "dwell", "agent", "--node", "R1", "--state", str(state), "--cell", str(file)]
+    agent = ["-m", "dwell", "agent", "--node", "R1", "--cell", str(file), "--state", str(state)]
     assert printed(processes, "agent@R1") == f"{agent}\n"
     assert "'--policy', 'LOC'" in printed(processes, "controller@E")
     assert all(os.getsid(one.pid) == one.pid for one in processes.running.values())

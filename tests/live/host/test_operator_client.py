@@ -13,6 +13,7 @@ from dwell.errors import LiveError
 from dwell.live.host.operator_client import OperatorClient
 from dwell.live.local.loopback import on_this_machine
 from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import Answer, Ask, decode, encode
 from dwell.live.wire.transport import Arrival
@@ -56,9 +57,11 @@ def test_a_late_answer_to_another_wish_is_not_taken_for_an_answer() -> None:
         # What was not answered before is answered now, and first.
         for one in (*pins, ask):
             refused = "late" if one.what == "pin" else ""
-            server.put(keys.answer(one.number), encode(Answer(one.number, refused, {})))
+            server.put(
+                keys.of(channels.ANSWER, one.number), encode(Answer(one.number, refused, {}))
+            )
 
-    for key in (keys.ask(), keys.look()):
+    for key in (keys.of(channels.ASK), keys.of(channels.LOOK)):
         server.subscribe(key, answer)
     try:
         with OperatorClient(problem) as client:
@@ -82,9 +85,11 @@ def test_an_answer_is_shown_without_what_a_terminal_would_obey() -> None:
         ask = decode(sample.payload, Ask)
         refused = "" if ask.what == "status" else "no\x1b[2Jbody"
         status = {"health": "ok", "note": "\x1b]0;mine\x07", "list": ["a\nb", 3]}
-        server.put(keys.answer(ask.number), encode(Answer(ask.number, refused, status)))
+        server.put(
+            keys.of(channels.ANSWER, ask.number), encode(Answer(ask.number, refused, status))
+        )
 
-    for key in (keys.ask(), keys.look()):
+    for key in (keys.of(channels.ASK), keys.of(channels.LOOK)):
         server.subscribe(key, answer)
     try:
         with OperatorClient(problem) as client:

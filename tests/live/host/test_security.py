@@ -20,6 +20,7 @@ from dwell.live.trust import KEYS
 from dwell.live.trust.authority import Authority, general_name
 from dwell.live.trust.request import private_pem
 from dwell.live.trust.roster import Subject, write_private
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Locator, Role, WiringEntry, wire
@@ -144,7 +145,7 @@ def until(holds: Callable[[], object], again: Callable[[], None] = lambda: None)
 def greet(victim: Victim, problem: Problem, authority: Authority, word: bytes) -> None:
     """Have somebody with good keys come later, and be heard."""
     with Intruder(victim.port, tls(authority.folder / "R2")) as friend:
-        key = Keys(problem.name).load("R2")
+        key = Keys(problem.name).of(channels.LOAD, "R2")
         until(lambda: (key, word) in victim.heard, lambda: friend.put(key, word))
 
 
@@ -166,7 +167,7 @@ def expired(authority: Authority, folder: Path, seconds: float = -60.0) -> Path:
 def test_who_has_no_good_certificate_gets_no_connection(
     problem: Problem, authority: Authority, victim: Victim, tmp_path: Path, kind: str
 ) -> None:
-    order = Keys(problem.name).order()
+    order = Keys(problem.name).of(channels.ORDER)
     protocol = "tcp" if kind == "tcp" else "tls"
     more: dict[str, object] = {}
     if kind == "no certificate":
@@ -191,7 +192,7 @@ def test_who_has_no_good_certificate_gets_no_connection(
 def test_a_connection_ends_with_its_certificate(
     problem: Problem, authority: Authority, victim: Victim, tmp_path: Path
 ) -> None:
-    key = Keys(problem.name).load("R2")
+    key = Keys(problem.name).of(channels.LOAD, "R2")
     with Intruder(victim.port, tls(expired(authority, tmp_path / "R2", 3.0))) as late:
         until(lambda: (key, b"early") in victim.heard, lambda: late.put(key, b"early"))
         until(lambda: not late.peers["control"])
@@ -234,11 +235,17 @@ def test_only_the_controller_orders(
         Intruder(victim.port, tls(authority.folder / "controller")) as controller,
     ):
         until(lambda: intruder.peers["control"] == controller.peers["control"] == 1)
-        for key in (keys.order(), keys.carried(), keys.stamped(), keys.load("E"), "dwell/other/x"):
+        for key in (
+            keys.of(channels.ORDER),
+            keys.of(channels.CARRIED),
+            keys.of(channels.STAMPED),
+            keys.of(channels.LOAD, "E"),
+            "dwell/other/x",
+        ):
             intruder.put(key, b"false " + word)
         until(
-            lambda: (keys.order(), b"true " + word) in victim.heard,
-            lambda: controller.put(keys.order(), b"true " + word),
+            lambda: (keys.of(channels.ORDER), b"true " + word) in victim.heard,
+            lambda: controller.put(keys.of(channels.ORDER), b"true " + word),
         )
         greet(victim, problem, authority, b"after " + word)
     assert all(payload != b"false " + word for _, payload in victim.heard)
@@ -246,7 +253,7 @@ def test_only_the_controller_orders(
 
 def test_who_is_revoked_is_not_heard(problem: Problem, tmp_path: Path) -> None:
     authority = issued(problem, tmp_path / "keys")
-    key = Keys(problem.name).load("R2")
+    key = Keys(problem.name).of(channels.LOAD, "R2")
     old = tmp_path / "old"
     shutil.copytree(authority.folder / "R2", old)
     authority.revoke("R2")

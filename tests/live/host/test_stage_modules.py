@@ -47,7 +47,7 @@ def test_topics_without_the_extra_name_the_line_that_installs_it(
     problem = dwell.load(cell)
     require_stages(problem, cell, NODES)
     monkeypatch.setattr("dwell.errors.find_spec", lambda name: None)
-    with pytest.raises(LiveError, match=r"rosbags and xxhash not installed; .* '\.\[ros2\]'"):
+    with pytest.raises(LiveError, match=r"rosbags and xxhash are not installed; .*\[ros2\]'"):
         require_stages(problem, cell, ["R1"])
     # A node without a topic needs no extra.
     require_stages(problem, cell, ["E"])

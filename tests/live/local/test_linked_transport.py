@@ -12,37 +12,19 @@ import pytest
 
 from dwell.live.local.linked_transport import LinkedTransport, target_of, without_source
 from dwell.live.local.message_links import LinkEnds, LinkFile
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
-from dwell.live.wire.transport import Arrival, Lane, Receive
+from dwell.live.wire.transport import Arrival, Lane
 from dwell.model import Constant, Link, Normal
+from tests.live.direct_transport import DirectTransport
 from tests.live.transport.meshes import ZenohMesh, introduce
 from tests.waiting import wait_until
 
 NODES = "R1", "E", "R2"
 KEYS = Keys("cell")
-TO_E = KEYS.inputs("perception", "E")
+TO_E = KEYS.of(channels.INPUT, "perception", "E", "main")
 #: Of messages at once that are held in order by numbers.
 MANY = 50
-
-
-class Direct:
-    """A transport that hands every message to all who have subscribed, at once."""
-
-    def __init__(self) -> None:
-        self.receivers: list[Receive] = []
-        self.closed = False
-
-    def put(
-        self, key: str, payload: bytes | memoryview, header: bytes = b"", *, lane: Lane = "control"
-    ) -> None:
-        for receive in self.receivers:
-            receive(Arrival(key, bytes(payload), header))
-
-    def subscribe(self, key: str, receive: Receive) -> None:
-        self.receivers.append(receive)
-
-    def close(self) -> None:
-        self.closed = True
 
 
 @pytest.fixture
@@ -55,7 +37,7 @@ class Pair:
     """A sender on R1 and a receiver on E, and what has arrived there when."""
 
     def __init__(self, file: LinkFile) -> None:
-        carrier = Direct()
+        carrier = DirectTransport()
         self.sender = LinkedTransport(carrier, LinkEnds(file.path, "camera@R1", "R1"))
         self.receiver = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
         self.arrived: list[tuple[int, Arrival]] = []
@@ -77,14 +59,21 @@ def pair(file: LinkFile) -> Iterator[Pair]:
 
 
 def test_the_key_tells_what_is_for_one_node() -> None:
-    assert target_of(KEYS.inputs("planning", "R2", "shadow")) == "R2"
-    assert target_of(KEYS.state("planning", "E")) == "E"
-    assert target_of(KEYS.snapshot("planning", "E")) == "E"
-    for key in (KEYS.command("control"), KEYS.beat("R1", "stamper@R1"), KEYS.order(), KEYS.ask()):
+    assert target_of(KEYS.of(channels.INPUT, "planning", "R2", "shadow")) == "R2"
+    assert target_of(KEYS.of(channels.STATE, "planning", "E")) == "E"
+    assert target_of(KEYS.of(channels.SNAPSHOT, "planning", "E")) == "E"
+    for key in (
+        KEYS.of(channels.COMMAND, "control"),
+        KEYS.of(channels.BEAT, "R1", "stamper@R1"),
+        KEYS.of(channels.ORDER),
+        KEYS.of(channels.ASK),
+    ):
         assert target_of(key) is None
 
 
-@pytest.mark.parametrize("key", [TO_E, KEYS.stamped()], ids=["at the sender", "at the receiver"])
+@pytest.mark.parametrize(
+    "key", [TO_E, KEYS.of(channels.STAMPED)], ids=["at the sender", "at the receiver"]
+)
 def test_a_message_takes_its_delay_once_and_a_put_takes_none(
     file: LinkFile, pair: Pair, key: str
 ) -> None:
@@ -99,7 +88,9 @@ def test_a_message_takes_its_delay_once_and_a_put_takes_none(
     assert (sample.key, sample.payload, sample.header) == (key, b"x", b"header")
 
 
-@pytest.mark.parametrize("key", [TO_E, KEYS.stamped()], ids=["at the sender", "at the receiver"])
+@pytest.mark.parametrize(
+    "key", [TO_E, KEYS.of(channels.STAMPED)], ids=["at the sender", "at the receiver"]
+)
 def test_messages_of_a_key_keep_their_order_whatever_their_delays(
     file: LinkFile, pair: Pair, key: str
 ) -> None:
@@ -123,7 +114,7 @@ def test_a_rate_puts_messages_apart(file: LinkFile, pair: Pair) -> None:
 def test_what_is_put_on_a_link_that_is_down_is_lost(file: LinkFile, pair: Pair) -> None:
     file.set("R1", "E", down=True)
     pair.sender.put(TO_E, b"lost")
-    pair.sender.put(KEYS.stamped(), b"lost")
+    pair.sender.put(KEYS.of(channels.STAMPED), b"lost")
     file.set("R1", "E", down=False)
     pair.sender.put(TO_E, b"0")
     wait_until(lambda: len(pair.arrived) == 1)
@@ -151,21 +142,21 @@ def test_it_waits_for_a_link_that_retransmits(tmp_path: Path) -> None:
 def test_what_stays_on_its_node_meets_no_link(file: LinkFile) -> None:
     for source, target in itertools.permutations(NODES, 2):
         file.set(source, target, down=True)
-    carrier = Direct()
+    carrier = DirectTransport()
     here = LinkedTransport(carrier, LinkEnds(file.path, "perception@E", "E"))
     found: list[Arrival] = []
     here.subscribe("**", found.append)
     here.put(TO_E, b"1")
-    here.put(KEYS.stamped(), b"2", b"header")
+    here.put(KEYS.of(channels.STAMPED), b"2", b"header")
     # Of somebody who is on no node: an operator.
-    carrier.put(KEYS.ask(), b"3")
+    carrier.put(KEYS.of(channels.ASK), b"3")
     assert [(one.payload, one.header) for one in found] == [
         (b"1", b""),
         (b"2", b"header"),
         (b"3", b""),
     ]
     here.close()
-    here.put(KEYS.stamped(), b"4")
+    here.put(KEYS.of(channels.STAMPED), b"4")
     assert carrier.closed
 
 
@@ -178,7 +169,7 @@ def test_a_receiver_that_fails_does_not_stop_the_others(
     pair.receiver.subscribe("**", fail)
     file.set("R1", "E", delay_ms=Constant(5.0))
     for number in range(3):
-        pair.sender.put(KEYS.stamped(), b"%d" % number)
+        pair.sender.put(KEYS.of(channels.STAMPED), b"%d" % number)
     wait_until(lambda: len(pair.arrived) == 3)
     wait_until(lambda: "could not be handled" in caplog.text)
 
@@ -194,7 +185,9 @@ COUNT = 300
 SENDER, NEAR, FAR = "camera@R1", "stamper@R1", "perception@E"
 
 
-@pytest.mark.parametrize("key", [TO_E, KEYS.stamped()], ids=["at the sender", "at the receiver"])
+@pytest.mark.parametrize(
+    "key", [TO_E, KEYS.of(channels.STAMPED)], ids=["at the sender", "at the receiver"]
+)
 @pytest.mark.parametrize("lane", ["control", "images"])
 def test_a_share_crosses_a_link_of_zenoh_s(file: LinkFile, key: str, lane: Lane) -> None:
     mesh = ZenohMesh([SENDER, NEAR, FAR])
@@ -205,13 +198,13 @@ def test_a_share_crosses_a_link_of_zenoh_s(file: LinkFile, key: str, lane: Lane)
         )
         inbox, here = mesh.inbox(), mesh.inbox()
         far.subscribe(key, inbox)
-        near.subscribe(KEYS.beat("R1", "*"), here)
+        near.subscribe(KEYS.of(channels.BEAT, "R1", "*"), here)
         introduce(mesh, sender, key, [inbox], lane=lane)
-        introduce(mesh, sender, KEYS.beat("R1", SENDER), [here])
+        introduce(mesh, sender, KEYS.of(channels.BEAT, "R1", SENDER), [here])
         file.set("R1", "E", loss=0.3)
         for number in range(COUNT):
             sender.put(key, b"%d" % number, b"header", lane=lane)
-            sender.put(KEYS.beat("R1", SENDER), b"%d" % number)
+            sender.put(KEYS.of(channels.BEAT, "R1", SENDER), b"%d" % number)
             # Queues are short, and what does not fit is lost as well.
             mesh.until(lambda number=number: len(here.samples) > number)  # type: ignore[misc]
         file.set("R1", "E", loss=0.0)

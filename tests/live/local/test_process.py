@@ -19,6 +19,7 @@ from dwell.live.local.message_links import LinkFile
 from dwell.live.local.process import FaultyPlatform, main, program
 from dwell.live.local.processes import Processes
 from dwell.live.transport.zenoh import ZenohTransport
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import Beats, decode
 from dwell.live.wire.transport import Arrival
@@ -82,7 +83,7 @@ def test_faults_are_around_an_agent_and_what_it_starts(tmp_path: Path) -> None:
         processes.write()
         transport = ZenohTransport(entry_for(wire(problem), ["R1"]))
         try:
-            transport.subscribe(Keys(problem.name).beats("*"), hear)
+            transport.subscribe(Keys(problem.name).of(channels.BEATS, "*"), hear)
             processes.start_agent("R1")
             until_s = time.monotonic() + 60
             while not {"agent@R1", "stamper@R1", "sensing@R1"} <= heard.keys():

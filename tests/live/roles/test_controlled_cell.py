@@ -12,6 +12,7 @@ from msgspec.structs import replace as replaced
 from dwell.control import shadow_stamps
 from dwell.estimators import Corrected
 from dwell.live.roles.run_rows import Rows
+from dwell.live.wire import channels
 from dwell.live.wire.messages import Answer, Ask, Order, Stamped, decode, encode
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
@@ -44,8 +45,10 @@ def ask(world: World, what: str, about: str = "") -> str:
     """Ask the controller as a person does; returns why it refuses, or nothing."""
     keys, heard = world.keys, list[str]()
     visitor = world.network.transport(f"visitor{world.network.now_ns}", "R1")
-    visitor.subscribe(keys.answer("me"), lambda s: heard.append(decode(s.payload, Answer).refused))
-    sample = Arrival(keys.ask(), encode(Ask("me", what, about)))
+    visitor.subscribe(
+        keys.of(channels.ANSWER, "me"), lambda s: heard.append(decode(s.payload, Answer).refused)
+    )
+    sample = Arrival(keys.of(channels.ASK), encode(Ask("me", what, about)))
     # It has no wire of the cell's: it talks to the controller alone.
     reach, world.network.reach = world.network.reach, None
     world.cell.receive(sample, world.network.now_ns)
@@ -107,7 +110,8 @@ def listen(world: World) -> list[Stamped]:
     stamps: list[Stamped] = []
     visitor = world.network.transport("visitor", "R1")
     visitor.subscribe(
-        world.keys.stamped(), lambda sample: stamps.append(decode(sample.payload, Stamped))
+        world.keys.of(channels.STAMPED),
+        lambda sample: stamps.append(decode(sample.payload, Stamped)),
     )
     # It has no wire of the cell's.
     world.network.reach = None
@@ -169,7 +173,7 @@ def test_what_else_is_due_comes_between_an_order_and_its_record(problem: Problem
         return wake(now_ns)
 
     def hear(sample: Arrival) -> None:
-        if sample.key == world.keys.order() and decode(sample.payload, Order).placement:
+        if sample.key == world.keys.of(channels.ORDER) and decode(sample.payload, Order).placement:
             events.append("order")
 
     def appended(rows: Rows, **meta: object) -> None:
@@ -236,7 +240,7 @@ def test_an_order_that_is_refused_for_now_is_asked_for_anew(problem: Problem) ->
     numbers = list[int]()
 
     def hear(sample: Arrival) -> None:
-        if sample.key == world.keys.order():
+        if sample.key == world.keys.of(channels.ORDER):
             order = decode(sample.payload, Order)
             numbers.extend([order.number] if order.placement else [])
 
@@ -266,7 +270,10 @@ def test_an_order_that_comes_after_the_guards_move_has_not_brought_it_about(
     twin, ordered_ns = alternating(problem), list[int]()
 
     def hear(sample: Arrival) -> None:
-        if sample.key == twin.keys.order() and decode(sample.payload, Order).placement == "LOC":
+        if (
+            sample.key == twin.keys.of(channels.ORDER)
+            and decode(sample.payload, Order).placement == "LOC"
+        ):
             ordered_ns.append(twin.network.now_ns)
 
     twin.network.taps.append(hear)

@@ -6,6 +6,7 @@ import pytest
 
 import dwell
 from dwell.live.roles.role import RIVAL_BEATS, Pulse, RolePlace
+from dwell.live.wire import channels
 from dwell.live.wire.messages import Beat, encode
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
@@ -24,7 +25,7 @@ def test_other_cell_files_and_versions_are_named(problem: Problem) -> None:
     world.run(1_000)
     stamper = world.stamper
     digest = digests(world.problem)["wiring"]
-    key = stamper.place.keys.beat("E", "agent@E")
+    key = stamper.place.keys.of(channels.BEAT, "E", "agent@E")
 
     def beat(cell: str, version: str) -> str:
         one = Beat("agent@E", "E", 99, 1, True, cell=cell, version=version)
@@ -54,7 +55,7 @@ def test_a_process_of_another_cell_file_is_shown_by_the_controller(problem: Prob
     keys, now_ns = world.stamper.place.keys, world.network.now_ns
     for who, node in (("stamper@R1", "R1"), ("agent@E", "E")):
         one = Beat(who, node, 99, 1, True, cell="other", version=dwell.__version__)
-        cell.receive(Arrival(keys.beat(node, who), encode(one)), now_ns)  # type: ignore[attr-defined]
+        cell.receive(Arrival(keys.of(channels.BEAT, node, who), encode(one)), now_ns)  # type: ignore[attr-defined]
     found = cell.status(now_ns)  # type: ignore[attr-defined]
     assert found["strangers"]["agent@E"].startswith("agent@E has another cell file (other)")
     # Its candidates may be others of the same names: it is ordered nothing.
@@ -68,7 +69,7 @@ def test_two_processes_of_one_name_are_noticed(problem: Problem) -> None:
     end = Network(delay_ns=0, start_ns=MS).transport("me", "R1")
     place = RolePlace(problem, "stamper@R1", "R1", end)
     pulse = Pulse(place, lambda: (True, ""), hears=[("*", "*")])
-    key = place.keys.beat("E", "agent@E")
+    key = place.keys.of(channels.BEAT, "E", "agent@E")
 
     def beat(life: int, sent_ns: int) -> None:
         one = Beat("agent@E", "E", life, sent_ns, True, cell=digests(problem)["wiring"])

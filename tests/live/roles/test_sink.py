@@ -11,6 +11,7 @@ import dwell
 from dwell.live.host.hosting import Hosted
 from dwell.live.roles.sink import Sink
 from dwell.live.stage import Message
+from dwell.live.wire import channels
 from dwell.live.wire.messages import Beat, Header, Stamp, decode
 from dwell.live.wire.transport import Arrival
 from tests.live.small_world import MS, Arm, World, canonical, columns
@@ -172,7 +173,7 @@ def test_a_sink_beats_while_its_actuator_does_not_return(
     beats: list[Beat] = []
 
     def hear(sample: Arrival) -> None:
-        if sample.key == refused.keys.beat("R2", "sink.control@R2"):
+        if sample.key == refused.keys.of(channels.BEAT, "R2", "sink.control@R2"):
             beats.append(decode(sample.payload, Beat))
 
     refused.sink.actuator = arm = Hanging(refused, passes_ms)

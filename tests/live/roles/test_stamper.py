@@ -8,6 +8,7 @@ import pytest
 
 from dwell.control import Probation
 from dwell.live.roles.stamper import Stamper
+from dwell.live.wire import channels
 from dwell.live.wire.continuity import CLAIMED_RUN_LIMIT, CLAIMS
 from dwell.live.wire.messages import Beat, encode
 from dwell.live.wire.transport import Arrival
@@ -52,7 +53,7 @@ def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:
     assert isinstance(stamper, Stamper)
     assert stamper.cycle == 0
     period_ms = problem.pipeline.period_ms
-    key = stamper.place.keys.frame()
+    key = stamper.place.keys.of(channels.FRAME)
     for _ in range(1_000):
         stamper.receive(Arrival(key, b""), world.network.now_ns)
         world.run(period_ms / 100)
@@ -135,7 +136,7 @@ def claim(world: World, run: int, times: int) -> None:
         # Later than all that the sink says itself for a while.
         sent_ns = world.network.now_ns + (number + 1) * MS
         beat = Beat(SINK, "R2", 10**9, sent_ns, True, cell=digest, run=run)
-        key = world.keys.beat("R2", SINK)
+        key = world.keys.of(channels.BEAT, "R2", SINK)
         world.stamper.receive(Arrival(key, encode(beat)), world.network.now_ns)
 
 

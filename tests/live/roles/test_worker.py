@@ -15,6 +15,7 @@ from dwell.live.host.hosting import work
 from dwell.live.roles.role import RolePlace
 from dwell.live.roles.worker import Worker
 from dwell.live.stage import Message
+from dwell.live.wire import channels
 from dwell.live.wire.messages import Beat, Header, Snapshot, Stamp, decode, encode
 from dwell.live.wire.routing import STAMPER
 from dwell.live.wire.transport import Arrival, Receive
@@ -186,7 +187,7 @@ def test_frames_begin_cycles(problem: Problem, stage: Passing) -> None:
     thread.join()
     note = next(beat.note for beat in wire.beats if beat.note and beat.ready)
     if isinstance(stage, Camera):
-        assert wire.put_keys.count(place.keys.frame()) == 3
+        assert wire.put_keys.count(place.keys.of(channels.FRAME)) == 3
         assert note == "sensing on R1: wait() raised OSError: the cable is off"
     else:
         assert note == "sensing on R1: no method wait(), though live.release is frames"
@@ -209,14 +210,14 @@ def test_a_worker_s_beats_go_on_while_its_stage_writes_its_state(problem: Proble
     wire, stage = Wire(), Slow()
     place = RolePlace(cell, "planning@R2", "R2", wire)
     worker = Worker(place, "planning", stage)
-    worker.state_at = 1, 5
+    worker.transfer.at = 1, 5
     asked = Snapshot(7, "planning", "R2", "E", 1, 6)
-    worker.receive(Arrival(place.keys.snapshot("planning", "R2"), encode(asked)), 0)
+    worker.receive(Arrival(place.keys.of(channels.SNAPSHOT, "planning", "R2"), encode(asked)), 0)
     stopped = threading.Event()
     thread = threading.Thread(target=work, args=(worker, wire), kwargs={"stopped": stopped})
     thread.start()
     wait_until(lambda: sum(beat.moving and beat.ready for beat in wire.beats) > 5)
-    key = place.keys.state("planning", "E", "R2")
+    key = place.keys.of(channels.STATE, "planning", "E", "R2")
     assert key not in wire.put_keys
     stage.released.set()
     wait_until(lambda: key in wire.put_keys and not wire.beats[-1].moving)
@@ -233,7 +234,7 @@ def test_a_source_at_work_is_woken_for_its_beats_only(problem: Problem) -> None:
     worker, stamper, now_ns = world.worker("sensing@R1"), world.stamper, world.network.now_ns
     worker.busy_since_ns = now_ns
     stamp = Stamp(stamper.run, stamper.cycle + 1, stamper.term, stamper.placement, now_ns)
-    key = world.keys.inputs("sensing", "R1")
+    key = world.keys.of(channels.INPUT, "sensing", "R1", "main")
     head = encode(Header(stamp, STAMPER, "R1", "none"))
     worker.receive(Arrival(key, b"", head), now_ns)
     assert worker.wake(now_ns + MS) > now_ns + MS

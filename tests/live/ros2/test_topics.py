@@ -165,7 +165,10 @@ def plain_publisher(
     with plain_session(network) as session:
         from dwell.live.ros2.message_types import message_types
 
-        publisher = session.declare_publisher(key + message_types().hash(kind))
+        # A publisher that drops messages may lose some on a busy machine.
+        publisher = session.declare_publisher(
+            key + message_types().hash(kind), congestion_control=zenoh.CongestionControl.BLOCK
+        )
         # Its type is declared as bool, and is not.
         wait_until(
             lambda: cast(Any, publisher.matching_status).matching, "the source's subscription"

@@ -16,6 +16,7 @@ import pytest
 import zenoh
 
 from dwell.live.host.security import VISITORS_AT_ONCE
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.wiring import Session, longest_message_bytes, wire
 from dwell.model import Host, Problem
@@ -101,7 +102,7 @@ def test_messages_that_are_too_long_take_no_memory(
 ) -> None:
     """37 messages of 30 to 80 MB, of several connections, priorities and reliabilities at once."""
     victim = Victim(who, session, tmp_path)
-    key = Keys(victim.problem.name).load("R2")
+    key = Keys(victim.problem.name).of(channels.LOAD, "R2")
     ways = [
         (priority, reliability)
         for priority in (zenoh.Priority.REAL_TIME, zenoh.Priority.DATA, zenoh.Priority.BACKGROUND)

@@ -15,6 +15,7 @@ import dwell
 from dwell.live.trust.acl import access_control
 from dwell.live.trust.permissions import subjects
 from dwell.live.trust.roster import Roster, Subject
+from dwell.live.wire import channels
 from dwell.live.wire.keys import CONTROLLER, Keys
 from dwell.live.wire.wiring import roles
 from dwell.model import Problem
@@ -152,12 +153,12 @@ def test_nobody_else_may(seed: int, data: st.DataObject) -> None:
 def test_who_is_revoked_is_nobody(problem: Problem) -> None:
     keys = Keys(problem.name)
     wall = wall_of(problem, roster_of(problem, without="R2"))
-    assert not wall.lets("R2.1", keys.done("control"))
-    assert not wall.lets("R2.1", keys.done("control"), "declare_subscriber")
+    assert not wall.lets("R2.1", keys.of(channels.DONE, "control"))
+    assert not wall.lets("R2.1", keys.of(channels.DONE, "control"), "declare_subscriber")
     # What follows a revoked certificate has another name in it.
     wall = wall_of(problem, roster_of(problem, generation=2))
-    assert not wall.lets("R2.1", keys.done("control"))
-    assert wall.lets("R2.2", keys.done("control"))
+    assert not wall.lets("R2.1", keys.of(channels.DONE, "control"))
+    assert wall.lets("R2.2", keys.of(channels.DONE, "control"))
 
 
 def test_a_name_alone_gives_no_role(problem: Problem) -> None:
@@ -169,9 +170,9 @@ def test_a_name_alone_gives_no_role(problem: Problem) -> None:
         CONTROLLER: Subject(CONTROLLER, "node", 1, 2, "", *LIFE),
     }
     wall = wall_of(problem, Roster(problem.name, 1, {**roster.subjects, **changed}))
-    assert not wall.lets("E.1", keys.load("E"))
-    assert not wall.lets("controller.1", keys.order())
-    assert wall.lets("E.1", keys.look())
+    assert not wall.lets("E.1", keys.of(channels.LOAD, "E"))
+    assert not wall.lets("controller.1", keys.of(channels.ORDER))
+    assert wall.lets("E.1", keys.of(channels.LOOK))
 
 
 def test_an_empty_roster_lets_nothing_pass(problem: Problem) -> None:

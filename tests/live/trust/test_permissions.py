@@ -8,6 +8,7 @@ import pytest
 
 import dwell
 from dwell.live.trust.permissions import senders, subjects
+from dwell.live.wire import channels
 from dwell.live.wire.keys import CONTROLLER, Keys
 from dwell.live.wire.wiring import roles
 from dwell.model import Problem
@@ -69,7 +70,7 @@ def test_who_may_put_what_in_the_canonical_cell(problem: Problem) -> None:
 
 
 def test_frames_are_asked_for_by_the_source_where_they_begin_the_cycles(problem: Problem) -> None:
-    frame = Keys(problem.name).frame()
+    frame = Keys(problem.name).of(channels.FRAME)
     assert frame not in senders(problem)
     framed = replace(problem, live=replace(problem.live, release="frames"))
     assert senders(framed)[frame] == {"R1"}

@@ -17,6 +17,7 @@ from dwell.live.trust import signing
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.signing import Seals
+from dwell.live.wire import channels
 from dwell.live.wire.keys import CONTROLLER, Keys
 from dwell.live.wire.messages import (
     SIGNATURE_BYTES,
@@ -92,7 +93,7 @@ def test_one_signed_claim_of_a_run_is_believed(
     now_ns = world.network.now_ns
     digest = digests(world.problem)["wiring"]
     beat = Beat(who, "R2", 10**9, now_ns, True, cell=digest, run=stamper.run + 5)
-    key = world.keys.detour(world.keys.beat("R2", who))
+    key = world.keys.detour(world.keys.of(channels.BEAT, "R2", who))
     data = seals[signs].seal(world.keys.word(key), encode(beat))
     before = stamper.run
     stamper.receive(Arrival(key, data), now_ns)
@@ -101,7 +102,7 @@ def test_one_signed_claim_of_a_run_is_believed(
 
 def ordered(world: World, order: Order, seals: Seals | None, word: str = "order") -> Arrival:
     data = encode(order)
-    key = world.keys.order()
+    key = world.keys.of(channels.ORDER)
     return Arrival(key, data if seals is None else seals.seal(word, data))
 
 
@@ -290,7 +291,7 @@ def done_now(world: World, cycle: int, node: str = "R2", sink: str = "control") 
 
 
 def carried(world: World, *messages: tuple[str, bytes]) -> Arrival:
-    return Arrival(world.keys.carried(), encode(Carried(messages)))
+    return Arrival(world.keys.of(channels.CARRIED), encode(Carried(messages)))
 
 
 @pytest.fixture
@@ -311,18 +312,20 @@ def test_a_relay_cannot_make_completions_up(world: World, forge: Callable[..., b
     guard, cycle = world.stamper.guard, world.stamper.cycle - 1
     newest = guard.newest
     for key, data in (
-        (keys.done("control"), forge(cycle)),
-        (keys.done("control"), forge(cycle, node="E")),
-        (keys.done("control"), encode(done_now(world, cycle))),
-        (keys.ended(), forge(cycle, word="ended")),
-        (keys.done("planning"), forge(cycle, by="R2")),
+        (keys.of(channels.DONE, "control"), forge(cycle)),
+        (keys.of(channels.DONE, "control"), forge(cycle, node="E")),
+        (keys.of(channels.DONE, "control"), encode(done_now(world, cycle))),
+        (keys.of(channels.ENDED), forge(cycle, word="ended")),
+        (keys.of(channels.DONE, "planning"), forge(cycle, by="R2")),
         # A good one, in another key's place.
-        (keys.done("control"), forge(cycle, by="R2", word="ended")),
+        (keys.of(channels.DONE, "control"), forge(cycle, by="R2", word="ended")),
     ):
         assert give(world, carried(world, (key, data))) == 1
         assert guard.newest == newest
     # The sink's node itself is believed, whoever carries it.
-    assert give(world, carried(world, (keys.done("control"), forge(cycle, by="R2")))) == 0
+    assert (
+        give(world, carried(world, (keys.of(channels.DONE, "control"), forge(cycle, by="R2")))) == 0
+    )
     assert guard.newest == cycle
 
 
@@ -332,10 +335,12 @@ def test_no_other_task_speaks_for_a_sink(world: World, seals: dict[str, Seals]) 
     world.run(2 * world.problem.pipeline.period_ms)
     keys, cycle = world.keys, world.stamper.cycle - 1
     others = encode(done_now(world, cycle, node="E", sink="planning"))
-    give(world, Arrival(keys.ended(), seals["E"].seal("ended", others)))
+    give(world, Arrival(keys.of(channels.ENDED), seals["E"].seal("ended", others)))
     assert world.stamper.guard.newest < cycle
     own = encode(done_now(world, cycle))
-    assert give(world, Arrival(keys.done("control"), seals["R2"].seal("done", own))) == 0
+    assert (
+        give(world, Arrival(keys.of(channels.DONE, "control"), seals["R2"].seal("done", own))) == 0
+    )
     assert world.stamper.guard.newest == cycle
 
 
@@ -345,7 +350,7 @@ def test_a_relay_that_repeats_itself_does_not_hide_a_fault(world: World) -> None
     receive = world.stamper.receive
 
     def listen(sample: Arrival, now_ns: int) -> None:
-        if sample.key == world.keys.carried():
+        if sample.key == world.keys.of(channels.CARRIED):
             heard.append(sample)
         receive(sample, now_ns)
 
@@ -371,8 +376,9 @@ def test_orders_take_no_detour(world: World, seals: dict[str, Seals]) -> None:
     sealed = ordered(world, order_of(world, "LOC"), seals[CONTROLLER]).payload
     root = keys.root
     for key in (
-        keys.order(), keys.frame(), keys.stamped(), keys.detour(keys.order()), f"order/{root}/done",
-        "order", f"{root}/detour/detour/order", f"{'x' * len(root)}/done/order",
+        keys.of(channels.ORDER), keys.of(channels.FRAME), keys.of(channels.STAMPED),
+        keys.detour(keys.of(channels.ORDER)), f"order/{root}/done", "order",
+        f"{root}/detour/detour/order", f"{'x' * len(root)}/done/order",
     ):  # fmt: skip
         give(world, carried(world, (key, sealed)))
     assert world.stamper.placement == "SO"
@@ -390,7 +396,7 @@ def beat_of(world: World, who: str, node: str, **more: object) -> Beat:
 def test_a_relay_cannot_make_beats_up(world: World, seals: dict[str, Seals]) -> None:
     keys, who = world.keys, "control@R2"
     beat = beat_of(world, who, "R2", ready=False)
-    key = keys.beat("R2", who)
+    key = keys.of(channels.BEAT, "R2", who)
     before = world.stamper.pulse.detector.last(who)
     for data in (encode(beat), seals["E"].seal("beat", encode(beat))):
         assert give(world, carried(world, (key, data))) == 1
@@ -405,10 +411,12 @@ def test_a_beat_is_about_who_its_key_names(world: World, seals: dict[str, Seals]
     beat = beat_of(world, who, "R2", ready=False)
     before = world.stamper.pulse.detector.last(who)
     data = seals["E"].seal("beat", encode(beat))
-    assert give(world, Arrival(keys.beat("E", "perception@E"), data)) == 1
+    assert give(world, Arrival(keys.of(channels.BEAT, "E", "perception@E"), data)) == 1
     later = encode(msgspec.structs.replace(beat, sent_ns=beat.sent_ns + 1))
     for sealed in (seals["E"].seal("beat", later), seals["R2"].seal("beat", later)):
-        assert give(world, carried(world, (keys.beat("E", "perception@E"), sealed))) == 1
+        assert (
+            give(world, carried(world, (keys.of(channels.BEAT, "E", "perception@E"), sealed))) == 1
+        )
     assert world.stamper.pulse.detector.last(who) == before
 
 
@@ -416,7 +424,7 @@ def beats_of(world: World, node: str, *names: str, **more: object) -> Arrival:
     """Beats of some processes, as the agent of a node sends them."""
     nodes = {role.who: role.node for role in roles(world.problem)}
     beats = tuple(beat_of(world, who, nodes[who], **more) for who in names)
-    return Arrival(world.keys.beats(node), encode(Beats(beats)))
+    return Arrival(world.keys.of(channels.BEATS, node), encode(Beats(beats)))
 
 
 def sealed(arrival: Arrival, seals: Seals) -> Arrival:
@@ -477,34 +485,44 @@ def test_the_controller_believes_the_stamper_alone(world: World, seals: dict[str
     keys, cell, stamper = world.keys, world.cell, world.stamper
     answer = Accepted(0, cell.name, "", stamper.run, stamper.term + 5, "LOC", stamper.cycle)
     for name in ("E", "R2", CONTROLLER):
-        assert world.tell(keys.accepted(), seals[name].seal("accepted", encode(answer))) == 1
-    assert world.tell(keys.accepted(), encode(answer)) == 1
-    gathered = encode(Carried(((keys.accepted(), seals["E"].seal("accepted", encode(answer))),)))
-    assert world.tell(keys.gathered(), gathered) == 1
+        assert (
+            world.tell(keys.of(channels.ACCEPTED), seals[name].seal("accepted", encode(answer)))
+            == 1
+        )
+    assert world.tell(keys.of(channels.ACCEPTED), encode(answer)) == 1
+    gathered = encode(
+        Carried(((keys.of(channels.ACCEPTED), seals["E"].seal("accepted", encode(answer))),))
+    )
+    assert world.tell(keys.of(channels.GATHERED), gathered) == 1
     assert cell.course.placement == "SO"
-    stamped = encode(Carried(((keys.stamped(), b"anything"),)))
-    assert world.tell(keys.gathered(), stamped) == 1
+    stamped = encode(Carried(((keys.of(channels.STAMPED), b"anything"),)))
+    assert world.tell(keys.of(channels.GATHERED), stamped) == 1
 
 
 def test_loads_and_states_are_told_by_their_node(world: World, seals: dict[str, Seals]) -> None:
     keys = world.keys
     load = Load("R1", 1, world.network.now_ns, 1, 1, 1)
-    assert world.tell(keys.load("R1"), seals["E"].seal("load", encode(load))) == 1
-    assert world.tell(keys.load("E"), seals["R1"].seal("load", encode(load))) == 1
-    assert world.tell(keys.load("R1"), seals["R1"].seal("load", encode(load))) == 0
+    assert world.tell(keys.of(channels.LOAD, "R1"), seals["E"].seal("load", encode(load))) == 1
+    assert world.tell(keys.of(channels.LOAD, "E"), seals["R1"].seal("load", encode(load))) == 1
+    assert world.tell(keys.of(channels.LOAD, "R1"), seals["R1"].seal("load", encode(load))) == 0
     restored = Restored(1, "planning", "R2", 1, 1)
-    assert world.tell(keys.restored(), seals["E"].seal("restored", encode(restored))) == 1
+    assert (
+        world.tell(keys.of(channels.RESTORED), seals["E"].seal("restored", encode(restored))) == 1
+    )
 
 
 def test_states_are_asked_for_by_the_controller(problem: Problem, seals: dict[str, Seals]) -> None:
     moving = stateful(problem, "planning", 100)
     world = World(moving, policy="LOC", seals=seals, stages={"planning": Counting})
     world.run(1_500)
-    worker, key = world.worker("planning@R2"), Keys(problem.name).snapshot("planning", "R2")
+    worker, key = (
+        world.worker("planning@R2"),
+        Keys(problem.name).of(channels.SNAPSHOT, "planning", "R2"),
+    )
     asked = encode(Snapshot(9, "planning", "R2", "E", 1, 1))
     for data in (asked, seals["E"].seal("snapshot", asked)):
         worker.receive(Arrival(key, data), world.network.now_ns)
-        assert worker._asked is None
+        assert worker.transfer.asked is None
     # And by orders the state moves as ever.
     world.pin("SO")
     world.run(1_500)
@@ -552,7 +570,7 @@ def command_of(world: World, cycle: int, seal: bytes, *, term: int = 1) -> Arriv
     stamper = world.stamper
     stamp = Stamp(stamper.run, cycle, term, stamper.placement, world.network.now_ns)
     header = Header(stamp, "planning", "E", "bytes", seal=seal)
-    return Arrival(world.keys.inputs("control", "R2"), b"-", encode(header))
+    return Arrival(world.keys.of(channels.INPUT, "control", "R2", "main"), b"-", encode(header))
 
 
 def test_a_cycle_that_nobody_has_stamped_stops_no_arm(

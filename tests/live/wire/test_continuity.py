@@ -12,6 +12,7 @@ from dwell.live.roles.failure_detector import FailureDetector
 from dwell.live.roles.latencies import Intervals
 from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import Offsets
+from dwell.live.wire import channels
 from dwell.live.wire.continuity import CONFIRMATIONS, RESERVED, Continuity, OvershootDetector
 from dwell.live.wire.messages import (
     Accepted,
@@ -61,7 +62,7 @@ def stamped(world: World, **false: object) -> None:
     true = Stamped(
         stamper.run, stamper.cycle, stamper.term, stamper.placement, world.network.now_ns
     )
-    hear(world, world.keys.stamped(), msgspec.structs.replace(true, **false))
+    hear(world, world.keys.of(channels.STAMPED), msgspec.structs.replace(true, **false))
 
 
 def completed(world: World, outcome: str = "actuated", **false: object) -> None:
@@ -79,7 +80,11 @@ def completed(world: World, outcome: str = "actuated", **false: object) -> None:
         "R2",
     )
     keys = world.keys
-    hear(world, keys.done("control") if outcome == "actuated" else keys.ended(), done)
+    hear(
+        world,
+        keys.of(channels.DONE, "control") if outcome == "actuated" else keys.of(channels.ENDED),
+        done,
+    )
 
 
 def answered(world: World, **false: object) -> None:
@@ -87,7 +92,7 @@ def answered(world: World, **false: object) -> None:
     stamper, cell = world.stamper, world.cell
     number, name = cell.order_number, cell.name
     true = Accepted(number, name, "", stamper.run, stamper.term, stamper.placement, stamper.cycle)
-    hear(world, world.keys.accepted(), msgspec.structs.replace(true, **false))
+    hear(world, world.keys.of(channels.ACCEPTED), msgspec.structs.replace(true, **false))
 
 
 def windows_go_on(world: World) -> None:

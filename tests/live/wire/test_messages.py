@@ -12,9 +12,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dwell.errors import LiveError
+from dwell.live.roles.joins import MAX_JOINS
 from dwell.live.roles.role import MAX_COMPLAINTS, MAX_STRANGERS, Pulse
-from dwell.live.roles.worker import MAX_JOINS, Worker
+from dwell.live.roles.worker import Worker
 from dwell.live.stage import Message
+from dwell.live.wire import channels
 from dwell.live.wire.messages import (
     MAX_CONTROL_BYTES,
     MAX_HEADER_BYTES,
@@ -31,7 +33,7 @@ from dwell.live.wire.routing import MAX_KNOWN
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
 from dwell.model.document import digests
-from tests.fuzz.targets import KINDS, wholes
+from tests.fuzz.targets import KINDS, every_key, wholes
 from tests.live.small_world import (
     EXEC_MS,
     Bench,
@@ -82,21 +84,6 @@ def roles_of(world: World) -> list[tuple[str, Any]]:
     return [
         (who, role.worker if isinstance(role, Bench) else role) for who, role in world.roles.items()
     ]
-
-
-def keys_of(world: World) -> list[str]:
-    """One key of every kind, for the role that hears it."""
-    keys = world.stamper.place.keys
-    plain = [
-        *(keys.inputs(task, node, kind) for task, node in (("perception", "E"), ("control", "R2"))
-          for kind in ("main", "shadow")),
-        *(keys.command("control"), keys.done("control"), keys.ended(), keys.stamped()),
-        *(keys.beat("E", "agent@E"), keys.frame(), keys.order(), keys.accepted()),
-        *(keys.load("E"), keys.snapshot("planning", "E")),
-        keys.state("planning", "E", "R2"),
-        *(keys.restored(), keys.ask(), keys.carried()),
-    ]  # fmt: skip
-    return [*plain, *(keys.detour(key) for key in plain), *(keys.relay(key) for key in plain)]
 
 
 # ------------------------------------------------------------------------------ the codec
@@ -200,7 +187,7 @@ def sample(data: st.DataObject, key: str) -> Arrival:
 @given(data=st.data())
 def test_no_role_falls_over_what_nobody_meant(world: World, data: st.DataObject) -> None:
     now_ns = world.network.now_ns
-    key = data.draw(st.sampled_from(keys_of(world)))
+    key = data.draw(st.sampled_from(every_key(world.stamper.place.problem)))
     found = sample(data, key)
     calls.clear()
     for _, role in roles_of(world):
@@ -216,7 +203,7 @@ def test_no_role_falls_over_what_nobody_meant(world: World, data: st.DataObject)
 
 def test_a_flood_of_nonsense_takes_no_memory(world: World) -> None:
     now_ns = world.network.now_ns
-    keys = keys_of(world)
+    keys = every_key(world.stamper.place.problem)
 
     def flood(count: int) -> None:
         for number in range(count):
@@ -248,20 +235,28 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
         stranger = Beat(f"y{number}", "E", 1, 1, True, cell=f"{number}")
         liar = Beat("agent@E", "E", 99, number, True, heard, cell=digest)
         found = [
-            *(Arrival(keys.beat("E", b.who), encode(b)) for b in (unknown, stranger, liar)),
+            *(
+                Arrival(keys.of(channels.BEAT, "E", b.who), encode(b))
+                for b in (unknown, stranger, liar)
+            ),
             Arrival(
-                keys.done("control"),
+                keys.of(channels.DONE, "control"),
                 encode(Completion(stamp, f"s{number}", 1, "actuated", (), "R2")),
             ),
-            Arrival(keys.ended(), encode(Completion(stamp, "control", 1, f"{number}", (), "R2"))),
-            Arrival(keys.order(), encode(Order(number, f"c{number}", 1, 1, f"p{number}"))),
-            Arrival(keys.stamped(), encode(stamp)),
+            Arrival(
+                keys.of(channels.ENDED),
+                encode(Completion(stamp, "control", 1, f"{number}", (), "R2")),
+            ),
+            Arrival(
+                keys.of(channels.ORDER), encode(Order(number, f"c{number}", 1, 1, f"p{number}"))
+            ),
+            Arrival(keys.of(channels.STAMPED), encode(stamp)),
         ]
         for task in tasks:
             for source in tasks:
                 head = encode(Header(stamp, source, "R1", "bytes"))
                 found += [
-                    Arrival(keys.inputs(task, node, "main"), b"payload", head)
+                    Arrival(keys.of(channels.INPUT, task, node, "main"), b"payload", head)
                     for node in ("R1", "E")
                 ]
         return found
@@ -299,6 +294,6 @@ def test_a_flood_of_well_formed_messages_takes_no_memory() -> None:
 def test_a_beat_of_an_unknown_process_is_not_heard(world: World) -> None:
     stamper = world.stamper
     beat = Beat("ghost@E", "E", 1, 1, True, cell=digests(world.problem)["wiring"])
-    stamper.receive(Arrival(stamper.place.keys.beat("E", "ghost@E"), encode(beat)), 0)
+    stamper.receive(Arrival(stamper.place.keys.of(channels.BEAT, "E", "ghost@E"), encode(beat)), 0)
     assert stamper.pulse.detector.last("ghost@E") is None
     assert "ghost@E on E is no process of cell 'canonical'" in stamper.place.complaints

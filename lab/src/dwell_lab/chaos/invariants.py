@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 from dwell.errors import LiveError
 from dwell.estimators.registry import resolved
+from dwell.live.wire import channels
+from dwell.live.wire.channels import CHANNELS
 from dwell.live.wire.keys import MAIN, Keys
 from dwell.live.wire.messages import (
     HANDED_OVER,
@@ -30,6 +32,8 @@ from dwell.policies.registry import estimator_of
 from dwell_lab.chaos.actuations import Seen
 from dwell_lab.chaos.stages import APPLY, HOLD, ZERO
 
+#: Channels of the messages that `Judge` reads.
+JUDGED = channels.STAMPED, channels.ORDER, channels.ACCEPTED, channels.DONE, channels.INPUT
 #: Smallest share of the commands that must reach the actuator while the status is `ok`.
 LEAST_APPLIED = 0.9
 #: Largest number of stamps, and of orders, in memory.
@@ -90,17 +94,17 @@ class Judge:
         word = Keys(self.problem.name).word(key)
         self.counts[word] += 1
         try:
-            match word:
-                case "stamped":
+            match CHANNELS.get(word):
+                case channels.STAMPED:
                     return self._stamped(at_ns, decode(payload, Stamped))
-                case "order":
+                case channels.ORDER:
                     return self._ordered(decode(payload, Order))
-                case "accepted":
+                case channels.ACCEPTED:
                     return self._accepted(decode(payload, Accepted))
-                case "in":
+                case channels.INPUT:
                     decoded = decode(header, Header, limit=MAX_HEADER_BYTES)
                     return list(self._routed(key, decoded))
-                case "done":
+                case channels.DONE:
                     return list(self._done(decode(payload, Completion)))
         except LiveError as error:
             return [f"{key}: {error}"]

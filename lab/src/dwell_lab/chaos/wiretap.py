@@ -19,10 +19,11 @@ from typing import Any
 from dwell.errors import LiveError
 from dwell.live.local.child import Child, Parent, Started
 from dwell.live.local.testbed import LocalTestbed
+from dwell.live.wire import channels
 from dwell.live.wire.keys import Keys
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import SESSIONS, Role, Session, Wiring, WiringEntry
-from dwell_lab.chaos.invariants import Judge
+from dwell_lab.chaos.invariants import JUDGED, Judge
 
 _HEAD = struct.Struct("<QIII")
 #: Longest time until each kind of message has been received once, seconds.
@@ -138,7 +139,7 @@ def main() -> None:
             stack.callback(transport.close)
             lock = threading.Lock()
             keys = Keys(problem.name)
-            inputs = keys.inputs("", "", "").rstrip("/")
+            inputs = f"{keys.of(channels.INPUT)}/"
 
             def write(sample: Arrival) -> None:
                 at_ns = time.monotonic_ns()
@@ -149,9 +150,8 @@ def main() -> None:
                 with lock:
                     file.write(_HEAD.pack(at_ns, *lengths) + key + payload + header)
 
-            for key in (keys.stamped(), keys.order(), keys.accepted(), keys.done("*")):
-                transport.subscribe(key, write)
-            transport.subscribe(keys.inputs("*", "*", "*"), write)
+            for channel in JUDGED:
+                transport.subscribe(keys.all(channel), write)
             return lambda _: None
 
         Parent().serve(begin)

@@ -15,7 +15,7 @@ import typer
 import dwell
 from dwell.cli.check import class_faults
 from dwell.cli.output import mark_of_run, print_json, working, write_file
-from dwell.errors import ExitCode, LiveError, ProblemError, installing, not_installed
+from dwell.errors import ExitCode, LiveError, ProblemError, installing, lacking
 from dwell.live.commands.live_view import CellState, Lines
 from dwell.live.host.stage_modules import require_stages
 from dwell.live.local.cell_observer import CellObserver, load_observer
@@ -38,7 +38,6 @@ from dwell.model.disturbed import Disturbed, disturbed
 from dwell.record import Run, moves_in, open_run, seal_run
 from dwell.record.journal import note_in_journal, read_plain_journal
 from dwell.report import run_html
-from dwell.report.formatting import listed
 from dwell.report.palette import Palette
 from dwell.report.phases import PhaseRow, phase_rows, phase_table
 from dwell.report.run_header import RunHeader
@@ -120,16 +119,12 @@ def _announce_left_out() -> tuple[bool, bool]:
 
     Returns whether the run will have a report, and whether it will have tables.
     """
-    lacking = not_installed("sim", "report")
-    if not lacking:
+    packages = lacking("sim", "report")
+    if not packages:
         return True, True
-    tables = "Polars" not in lacking
+    tables = "Polars" not in packages
     left_out = "no report" if tables else "no report, and no tables: the run stays a journal"
-    typer.echo(
-        f"note: there will be {left_out}, for {listed(lacking)} "
-        f"{'is' if len(lacking) == 1 else 'are'} not installed; {installing('report')}",
-        err=True,
-    )
+    typer.echo(f"note: there will be {left_out}, for {packages}", err=True)
     return False, tables
 
 

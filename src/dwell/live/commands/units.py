@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dwell.cli.output import write_file
+from dwell.live.host.node_processes import agent_words, controller_words
 from dwell.live.host.stage_modules import ros_topics
 from dwell.live.log import say
 from dwell.model import Problem
@@ -104,14 +105,12 @@ def unit_texts(
             settings=settings,
         )
 
-    state = f"{STATE}/{problem.name}/{node}"
-    agent = ("agent", "--node", node, "--cell", str(cell), "--state", state)
+    agent = agent_words(node, cell, f"{STATE}/{problem.name}/{node}")
     called = f"Dwell agent of node {node} of cell {problem.name}"
     name = f"dwell-agent@{escaped_name(problem.name)}-{escaped_name(node)}.service"
     units = {name: unit(called, agent, AGENT, beside=" time-sync.target")}
     if node == problem.controller_node:
-        files = ("--out", f"{STATE}/runs", "--state", STATE)
-        controller = ("controller", "--cell", str(cell), *files)
+        controller = controller_words(cell, f"{STATE}/runs", STATE)
         called = f"Dwell controller of cell {problem.name}"
         name = f"dwell-controller@{escaped_name(problem.name)}.service"
         units[name] = unit(called, controller, CONTROLLER)

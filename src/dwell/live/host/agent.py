@@ -20,8 +20,10 @@ from dwell.live.roles.role import AGENT_DELAY, CONTROLLER_BEAT, Pulse, RolePlace
 from dwell.live.roles.stage_counts import REPORT_NS
 from dwell.live.roles.worker import SHADOW_BEAT
 from dwell.live.transport.abandoned import OUT_OF_FILES
+from dwell.live.wire import channels
+from dwell.live.wire.channels import CHANNELS
 from dwell.live.wire.continuity import SetbackDetector
-from dwell.live.wire.keys import BEATS, TWICE
+from dwell.live.wire.keys import Channel
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
     Beat,
@@ -153,7 +155,7 @@ class Agent:
         yield from self.pulse.subscriptions()
         if self._relays:
             yield self.place.keys.relay(f"{self.place.keys.root}/**")
-            yield self.place.keys.missed()
+            yield self.place.keys.of(channels.MISSED)
 
     def _senders(self) -> set[str]:
         """Return the nodes whose processes send messages to this node."""
@@ -168,16 +170,17 @@ class Agent:
         keys, period_ns = self.place.keys, self.place.period_ns
         copied = sample.key.startswith(self._relay_prefix)
         key = sample.key.removeprefix(self._relay_prefix if copied else f"{keys.root}/")
-        word = key.partition("/")[0]
+        channel = CHANNELS.get(key.partition("/")[0])
         if not copied and self.pulse.hears(sample):
             self.pulse.receive(sample, now_ns)
         if not self._relays:
             return None
-        if word == "missed":
+        if channel is channels.MISSED:
             self._missed_ns = now_ns
-        if not (word in TWICE if copied else word == "beats"):
+        if channel is None or not (channel.twice if copied else channel is channels.BEATS):
             return None
-        (self._beats if word in BEATS else self._gathered).add(key, sample.payload)
+        beats = channel in (channels.BEAT, channels.BEATS)
+        (self._beats if beats else self._gathered).add(key, sample.payload)
         wanted = copied or 0 <= now_ns - self._missed_ns < 2 * period_ns
         if wanted and self._carried.add(key, sample.payload):
             self._carry_ns = min(self._carry_ns, now_ns + period_ns // 4)
@@ -204,7 +207,7 @@ class Agent:
                 self._due_ns[chore] = now_ns + every_ns
         if now_ns >= self._carry_ns:
             self._carry_ns = NEVER_NS
-            self._put(self.place.keys.carried(), self._carried.taken())
+            self._send(channels.CARRIED, self._carried.taken())
         wakes = [self._beat(now_ns), self._look_due_ns(), *self._due_ns.values()]
         wakes.append(self._carry_ns)
         if self._relays:
@@ -228,10 +231,10 @@ class Agent:
             beats += [beat for beat in found if beat and now_ns - beat.sent_ns <= patience_ns]
             times = {beat.who: beat.sent_ns for beat in beats}
             slots.write(encode(Receipt(place.life, now_ns, times, self.offsets.interval)))
-        key = place.keys.beats(place.node)
-        payload = place.sealed(key, Beats(tuple(beats)))
+        key = place.keys.of(channels.BEATS, place.node)
+        payload = place.sealed(channels.BEATS, Beats(tuple(beats)))
         if len(payload) > MAX_HEADER_BYTES:
-            payload = place.sealed(key, Beats(tuple(_shortened(beats))))
+            payload = place.sealed(channels.BEATS, Beats(tuple(_shortened(beats))))
         place.transport.put(key, payload)
         if self._relays:
             self._beats.add(key.removeprefix(f"{place.keys.root}/"), payload)
@@ -257,10 +260,10 @@ class Agent:
             messages += self._beats.taken()
             self._beats_ns = now_ns + CONTROLLER_BEAT * self.place.period_ns
         if messages:
-            self._put(self.place.keys.gathered(), messages)
+            self._send(channels.GATHERED, messages)
 
-    def _put(self, key: str, messages: list[tuple[str, bytes]]) -> None:
-        self.place.transport.put(key, encode(Carried(tuple(messages))))
+    def _send(self, channel: Channel[Carried], messages: list[tuple[str, bytes]]) -> None:
+        self.place.send(channel, Carried(tuple(messages)))
 
     def _count(self, _: int) -> None:
         """Read the stage counts for the next report of the load."""
@@ -281,7 +284,7 @@ class Agent:
         each = *processes.items(), (place.who, self.cpu_clock())
         load = Load(place.node, place.life, now_ns, *spent, used, each, self._stages)
         self._stages = ()
-        place.put_twice(place.keys.load(place.node), load)
+        place.send(channels.LOAD, load, place.node)
 
 
 def _shortened(beats: Iterable[Beat]) -> Iterator[Beat]:

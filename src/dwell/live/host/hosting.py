@@ -10,8 +10,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dwell.errors import LiveError, describe_raised
 from dwell.live.failures import end_process, start_thread
 from dwell.live.host.security import Security
+from dwell.live.roles.joins import Job
 from dwell.live.roles.role import RoleLogic
-from dwell.live.roles.worker import Job, Worker
+from dwell.live.roles.worker import Worker
 from dwell.live.stage import Message
 from dwell.live.wire.continuity import SetbackDetector
 from dwell.live.wire.transport import Arrival, Transport

@@ -13,6 +13,16 @@ from typing import Any
 from dwell.live.host.state_files import open_own
 
 
+def agent_words(node: str, cell: Path, state: Path | str) -> list[str]:
+    """Return the arguments of `dwell` that run the agent of a node."""
+    return ["agent", "--node", node, "--cell", str(cell), "--state", str(state)]
+
+
+def controller_words(cell: Path, out: Path | str, state: Path | str) -> list[str]:
+    """Return the arguments of `dwell` that run the controller of a cell."""
+    return ["controller", "--cell", str(cell), "--out", str(out), "--state", str(state)]
+
+
 class NodeProcesses:
     """Agents and controller of a cell, each with its log in one folder.
 
@@ -57,18 +67,17 @@ class NodeProcesses:
 
     def start_agent(self, node: str) -> None:
         """Start or restart a node's agent."""
-        self._start(f"agent@{node}", ["--node", node, "--state", str(self.folder / node)])
+        self._start(f"agent@{node}", agent_words(node, self.file, self.folder / node))
 
     def start_controller_on(self, node: str, out: Path, more: Sequence[str] = ()) -> None:
         """Start or restart the controller, which writes its runs to `out`."""
-        words = ["--out", str(out), "--state", str(self._root), *more]
-        self._start(f"controller@{node}", words)
+        words = controller_words(self.file, out, self._root)
+        self._start(f"controller@{node}", [*words, *more])
 
     def _start(self, who: str, words: Sequence[str]) -> None:
-        kind, _, node = who.partition("@")
-        command = [sys.executable, "-m", *self._program, kind, *words, "--cell", str(self.file)]
+        command = self._on(who.partition("@")[2], [sys.executable, "-m", *self._program, *words])
         with open(self.log(who), "ab", opener=open_own) as log:
-            self.running[who] = self._popen(self._on(node, command), stdout=log, stderr=log)
+            self.running[who] = self._popen(command, stdout=log, stderr=log)
 
     def _on(self, node: str, command: Sequence[str]) -> Sequence[str]:
         """Return a command that runs a command on a node."""

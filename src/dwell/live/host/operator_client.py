@@ -15,6 +15,7 @@ import msgspec
 from dwell.errors import LiveError, TrustError
 from dwell.live.host.security import Security
 from dwell.live.log import printable
+from dwell.live.wire import channels
 from dwell.live.wire.keys import CONTROLLER, Keys
 from dwell.live.wire.local_addresses import running_elsewhere
 from dwell.live.wire.messages import Answer, Ask, decode, encode
@@ -43,7 +44,7 @@ class OperatorClient:
         role = Role(self.name, problem.controller_node, "visitor")
         security = self._security = Security.of(problem, role, environment)
         self._transport = security.visit(self.name, self._controller)
-        self._transport.subscribe(self._keys.answer("*"), self._heard)
+        self._transport.subscribe(self._keys.of(channels.ANSWER, "*"), self._heard)
 
     def __enter__(self) -> OperatorClient:
         """Return itself."""
@@ -55,7 +56,7 @@ class OperatorClient:
 
     def _heard(self, sample: Arrival) -> None:
         # Skip the answers to other visitors.
-        if not sample.key.startswith(self._keys.answer(self.name)):
+        if not sample.key.startswith(self._keys.of(channels.ANSWER, self.name)):
             return
         try:
             answer = decode(sample.payload, Answer)
@@ -99,10 +100,10 @@ class OperatorClient:
         """Repeat a request until the controller answers, or the time is over."""
         # An observer's keys permit requests for the status.
         if what == "status":
-            number, key = self.name, self._keys.look()
+            number, key = self.name, self._keys.of(channels.LOOK)
         else:
             # A unique number distinguishes the answer from late answers to earlier requests.
-            number, key = f"{self.name}-{next(self._wishes)}", self._keys.ask()
+            number, key = f"{self.name}-{next(self._wishes)}", self._keys.of(channels.ASK)
         ask = encode(Ask(number, what, about))
         # Discard answers to the repeated messages of earlier requests.
         while not self._answers.empty():

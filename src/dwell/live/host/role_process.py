@@ -35,11 +35,12 @@ from dwell.live.host.state_files import (
 )
 from dwell.live.log import Log
 from dwell.live.roles.control_group import ControlGroup, own_group
+from dwell.live.roles.joins import Job
 from dwell.live.roles.role import Pulse, RoleLogic, RolePlace
 from dwell.live.roles.sink import Rest, Sink
 from dwell.live.roles.stage_counts import StageBook, book_path
 from dwell.live.roles.stamper import Stamper
-from dwell.live.roles.worker import Job, Worker
+from dwell.live.roles.worker import Worker
 from dwell.live.wire.messages import Header
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import Role as Named

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import asdict
 from pathlib import Path
 
-from dwell.errors import LiveError, missing_package, not_installed
+from dwell.errors import LiveError, lacking, missing_package
 from dwell.live.stage import (
     CellActuator,
     CellCode,
@@ -37,9 +38,8 @@ def require_stages(problem: Problem, cell: Path, nodes: Collection[str]) -> None
     names: dict[str, str | RosActuator | None]
     names = {f"tasks.{task.name}.run": task.run for task in tasks}
     names |= {f"live.actuators.{task.name}": actuators.get(task.name) for task in tasks}
-    packages = " and ".join(not_installed("ros2"))
-    if packages and ros_topics(problem, nodes):
-        raise LiveError(f"{packages} not installed; in a checkout of Dwell: pip install '.[ros2]'")
+    if ros_topics(problem, nodes) and (packages := lacking("ros2")):
+        raise LiveError(packages)
     for where, name in names.items():
         if not isinstance(name, str):
             continue
@@ -73,7 +73,7 @@ def stage_of(problem: Problem, name: str, index: int = 0) -> CellStage:
     if task.ros2 is not None:
         from dwell.live.ros2 import Source
 
-        stage: CellStage = Source.of(task.ros2)
+        stage: CellStage = Source(**asdict(task.ros2))
     elif task.run is not None:
         stage = load_stage(task.run, where)
     else:
@@ -90,7 +90,7 @@ def actuator_of(problem: Problem, name: str) -> CellActuator:
     if isinstance(given, RosActuator):
         from dwell.live.ros2 import Sink
 
-        actuator: CellActuator = Sink.of(given.ros2)
+        actuator: CellActuator = Sink(**asdict(given.ros2))
     else:
         actuator = load_actuator(given, where)
     _prepare(actuator, where, problem, name)

@@ -20,6 +20,7 @@ from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.roles.live_windows import LiveWindows
 from dwell.live.roles.role import CONTROLLER_BEAT, REPEATED_NS, Pulse, RolePlace
 from dwell.live.roles.run_rows import Resume, Rows
+from dwell.live.wire import channels
 from dwell.live.wire.continuity import Continuity, SetbackDetector
 from dwell.live.wire.keys import CONTROLLER
 from dwell.live.wire.messages import (
@@ -32,8 +33,6 @@ from dwell.live.wire.messages import (
     Snapshot,
     Stamp,
     Stamped,
-    decode,
-    encode,
 )
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
@@ -117,7 +116,6 @@ class ControlledCell:
         # Beats arrive in batches of the relay's agent. They carry their own times of sending and
         # arrival, so a delay on the detour does not harm clock comparisons.
         self.pulse = Pulse(place, lambda: (True, recorder.trouble), hears=(), every=CONTROLLER_BEAT)
-        self._keys = place.keys
         # Run, term and placement from the stamper's answers and stamps; its last answer, or None
         # if only stamps have confirmed the current term.
         self.course = controller.course
@@ -159,12 +157,8 @@ class ControlledCell:
 
     def subscriptions(self) -> Iterable[str]:
         """Key expressions to subscribe to."""
-        keys = self.place.keys
         yield from self.pulse.subscriptions()
-        yield from (keys.done("*"), keys.ended(), keys.accepted(), keys.load("*"))
-        yield from (keys.gathered(), keys.stamped())
-        yield keys.restored()
-        yield from (keys.ask(), keys.look())
+        yield from self.place.channels_to("controller")
 
     def receive(self, sample: Arrival, now_ns: int) -> int:
         """Process a message; return the instant of the next call of `wake`."""
@@ -196,9 +190,8 @@ class ControlledCell:
             self.windows.set_back(back_ns)
 
     def _take(self, sample: Arrival, now_ns: int) -> None:
-        keys = self._keys
-        word = keys.word(sample.key)
-        if word == "gathered":
+        channel = self.place.channel(sample)
+        if channel is channels.GATHERED:
             for arrival in self.place.around(sample):
                 self._take(arrival, now_ns)
             return
@@ -212,28 +205,26 @@ class ControlledCell:
             return
         windows = self.windows
         try:
-            match word:
-                case "stamped":
-                    self._stamped(decode(sample.payload, Stamped), now_ns)
-                case "done" | "ended" if windows is not None:
+            match channel:
+                case channels.STAMPED:
+                    self._stamped(self.place.read(channels.STAMPED, sample), now_ns)
+                case channels.DONE | channels.ENDED if windows is not None:
                     done = self.place.completion(sample)
                     who = f"{done.sink}@{done.node}"
                     # A source's guess counts if the stamper has released such a cycle.
                     guess = not done.stamp.term
                     if guess or self._goes_on(done.stamp, who, now_ns, alone=True):
                         windows.completed(done, now_ns)
-                case "load" if windows is not None:
+                case channels.LOAD if windows is not None:
                     windows.loaded(self.place.load(sample), now_ns)
-                case "accepted":
-                    answer = self.place.read(sample, Accepted, lambda _: self.place.stamper[0])
-                    self._answered(answer, now_ns)
-                case "restored":
-                    restored = self.place.read(sample, Restored, lambda told: told.node)
-                    self._restored(restored, now_ns)
-                case "ask":
-                    self._asked(decode(sample.payload, Ask), now_ns)
-                case "look":
-                    looks = Ask(decode(sample.payload, Ask).number, "status")
+                case channels.ACCEPTED:
+                    self._answered(self.place.read(channels.ACCEPTED, sample), now_ns)
+                case channels.RESTORED:
+                    self._restored(self.place.read(channels.RESTORED, sample), now_ns)
+                case channels.ASK:
+                    self._asked(self.place.read(channels.ASK, sample), now_ns)
+                case channels.LOOK:
+                    looks = Ask(self.place.read(channels.LOOK, sample).number, "status")
                     self._asked(looks, now_ns)
         except LiveError as error:
             self.place.complain(error)
@@ -440,7 +431,7 @@ class ControlledCell:
         if self.place.stamper[1] in self.pulse.strangers:
             # Its cell file differs, so its candidates may differ under the same names.
             return
-        self.place.put(self.place.keys.order(), order)
+        self.place.send(channels.ORDER, order)
 
     def _next_number(self) -> int:
         self.order_number += 1
@@ -520,7 +511,6 @@ class ControlledCell:
     def _ask_for_states(self, move: _Move, answer: Accepted) -> None:
         """Request the states of the tasks whose inputs are forked."""
         move.phase = "state"
-        keys = self.place.keys
         old = self.place.problem.candidates[answer.placement]
         for task, to in move.forks:
             number = self._next_number()
@@ -528,7 +518,7 @@ class ControlledCell:
             asked = Snapshot(number, task, old[task], to, answer.run, answer.cycle)
             # The receiving worker must know the request: it accepts only a requested state.
             for node in (to, old[task]):
-                self.place.put(keys.snapshot(task, node), asked)
+                self.place.send(channels.SNAPSHOT, asked, task, node)
 
     def _restored(self, restored: Restored, now_ns: int) -> None:
         move = self._move
@@ -671,7 +661,7 @@ class ControlledCell:
     def _asked(self, ask: Ask, now_ns: int) -> None:
         refused = self._do(ask, now_ns)
         answer = Answer(ask.number, refused, self.status(now_ns))
-        self.place.transport.put(self.place.keys.answer(ask.number), encode(answer))
+        self.place.send(channels.ANSWER, answer, ask.number)
 
     def _do(self, ask: Ask, now_ns: int) -> str:
         problem, told = self.place.problem, self._told

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 import msgspec
 
@@ -13,13 +13,14 @@ from dwell.errors import LiveError, TrustError
 from dwell.live.log import printable
 from dwell.live.roles.failure_detector import FailureDetector
 from dwell.live.roles.offsets import ClockOffset, Offsets
-from dwell.live.wire.keys import BEATS, CONTROLLER, RELAYED, Keys
+from dwell.live.wire import channels
+from dwell.live.wire.channels import CHANNELS, RELAYED
+from dwell.live.wire.keys import Channel, Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
     SIGNATURE_BYTES,
     Beat,
     Beats,
-    Carried,
     Completion,
     Header,
     Heard,
@@ -31,7 +32,7 @@ from dwell.live.wire.messages import (
     encode,
 )
 from dwell.live.wire.transport import Arrival, Transport
-from dwell.live.wire.wiring import roles
+from dwell.live.wire.wiring import Kind, roles
 from dwell.model import Problem
 from dwell.model.bounds import require
 from dwell.model.document import digests
@@ -162,34 +163,53 @@ class RolePlace:
             system_bound_ns=SYSTEM_BOUND_NS if system else None,
         )
 
-    def put(self, key: str, message: msgspec.Struct) -> None:
-        """Send a small message, signed if there are keys."""
-        self.transport.put(key, self.sealed(key, message))
+    def send(self, channel: Channel[T], message: T, *chunks: str) -> None:
+        """Send a small message as its channel requires: signed if there are keys, and twice.
 
-    def sealed(self, key: str, message: msgspec.Struct) -> bytes:
-        """Return an encoded message, signed if there are keys."""
-        data = encode(message)
-        return data if self.seals is None else self.seals.seal(self.keys.word(key), data)
-
-    def read(self, sample: Arrival, kind: type[T], by: Callable[[T], str]) -> T:
-        """Read a message that `put` or `put_twice` has sent.
-
-        `by` returns the required signer: a node or the controller. Raises a LiveError if the
-        message is of another kind or the signature is not from this signer.
+        Processes on the relay's own node send second copies, too: the detour reaches processes
+        without a direct connection to the sender.
         """
-        if self.seals is None:
-            return decode(sample.payload, kind)
-        message = decode(sample.payload[SIGNATURE_BYTES:], kind)
-        self._require(sample, by(message))
+        key, payload = self.keys.of(channel, *chunks), self.sealed(channel, message)
+        self.transport.put(key, payload)
+        if channel.twice:
+            self.transport.put(self.keys.relay(key), payload)
+
+    def sealed(self, channel: Channel[T], message: T) -> bytes:
+        """Return an encoded message, signed if its channel requires it and there are keys."""
+        data, signs = encode(message), channel.signer is not None
+        return self.seals.seal(channel.word, data) if signs and self.seals is not None else data
+
+    def read(self, channel: Channel[T], sample: Arrival) -> T:
+        """Read a message of a channel.
+
+        Raises a LiveError if it is of another kind, or not signed by the required signer.
+        """
+        message = self._decoded(channel, sample)
+        self._require_signer(channel, sample, message)
         return message
 
-    def _require(self, sample: Arrival, name: str) -> None:
-        """Raise a LiveError unless the named subject has signed a message."""
-        if self.seals is not None:
+    def _decoded(self, channel: Channel[T], sample: Arrival) -> T:
+        """Decode a message without a check of its signature."""
+        signed = self.seals is not None and channel.signer is not None
+        return decode(sample.payload[SIGNATURE_BYTES if signed else 0 :], channel.payload)
+
+    def _require_signer(self, channel: Channel[T], sample: Arrival, message: T) -> None:
+        """Raise a LiveError unless the channel's signer has signed a message, if there are keys."""
+        if self.seals is not None and channel.signer is not None:
+            name = channel.signer(self.problem, message)
             try:
-                self.seals.require(self.keys.word(sample.key), name, sample.payload)
+                self.seals.require(channel.word, name, sample.payload)
             except TrustError as error:
                 raise LiveError(str(error)) from None
+
+    def channel(self, sample: Arrival) -> Channel[Any] | None:
+        """Return the channel of a message; None if there is no such channel."""
+        return CHANNELS.get(self.keys.word(sample.key))
+
+    def channels_to(self, kind: Kind) -> Iterable[str]:
+        """Yield the key expressions of the channels whose receivers are of a kind."""
+        channels = (channel for channel in CHANNELS.values() if kind in channel.receivers)
+        yield from map(self.keys.all, channels)
 
     def stamped(self, stamp: Stamp) -> bytes:
         """Return this process's signature of a stamp; empty without keys."""
@@ -216,9 +236,10 @@ class RolePlace:
 
         Raises a LiveError if it is not a completion, or if its task cannot run on its node.
         """
-        done = self.read(sample, Completion, lambda done: done.node)
+        ends = self.channel(sample) is channels.ENDED
+        done = self.read(channels.ENDED if ends else channels.DONE, sample)
         task = self.problem.pipeline.tasks.get(done.sink)
-        named = self.keys.word(sample.key) == "ended" or sample.key.endswith(f"/{done.sink}")
+        named = ends or sample.key.endswith(f"/{done.sink}")
         if task is None or done.node not in task.on or not named:
             raise LiveError(f"{sample.key}: {done.sink} does not run on {done.node}")
         return done
@@ -228,7 +249,7 @@ class RolePlace:
 
         Raises a LiveError if it is not a load, or if its node differs from the node in its key.
         """
-        load = self.read(sample, Load, lambda load: load.node)
+        load = self.read(channels.LOAD, sample)
         if not sample.key.endswith(f"/{load.node}"):
             raise LiveError(f"{sample.key}: the load of {load.node}")
         return load
@@ -240,45 +261,33 @@ class RolePlace:
         sender may not send. Access control has checked the certificate of the sender of direct
         beats. The signature is checked only for beats from the detour.
         """
-        signed = 0 if self.seals is None else SIGNATURE_BYTES
-        data = sample.payload[signed:]
-        controller = f"controller@{self.problem.controller_node}"
-        if self.keys.word(sample.key) == "beats":
-            beats = decode(data, Beats).beats
+        channel = CHANNELS[self.keys.word(sample.key)]
+        message: Beat | Beats = self._decoded(channel, sample)
+        if isinstance(message, Beats):
+            beats, controller = message.beats, f"controller@{self.problem.controller_node}"
             node = sample.key.rpartition("/")[2]
             good = beats[0].who == f"agent@{node}"
             good &= all(beat.node == node and beat.who != controller for beat in beats)
         else:
-            beats = (decode(data, Beat),)
-            good = sample.key.endswith(f"/{beats[0].node}/{beats[0].who}")
+            beats = (message,)
+            good = sample.key.endswith(f"/{message.node}/{message.who}")
         if not good:
             names = ", ".join(f"{beat.who} on {beat.node}" for beat in beats[:3])
             raise LiveError(f"{sample.key}: a beat of {names}")
         if not self.keys.came_directly(sample.key):
-            controls = beats[0].who == controller
-            self._require(sample, CONTROLLER if controls else beats[0].node)
+            self._require_signer(channel, sample, message)
         return beats
-
-    def put_twice(self, key: str, message: msgspec.Struct) -> None:
-        """Send a small message directly and over the detour, signed if there are keys.
-
-        Processes on the relay's own node do this too: the detour reaches processes without a
-        direct connection to the sender.
-        """
-        payload = self.sealed(key, message)
-        self.transport.put(key, payload)
-        self.transport.put(self.keys.relay(key), payload)
 
     def around(self, sample: Arrival) -> list[Arrival]:
         """Return the messages that the relay has sent in one batch."""
         try:
-            carried = decode(sample.payload, Carried)
+            carried = self.read(channels.CARRIED, sample)
         except LiveError as error:
             self.complain(error)
             return []
         keys = self.keys
         arrivals = [Arrival(keys.detour(key), payload) for key, payload in carried.messages]
-        fit = [arrival for arrival in arrivals if keys.word(arrival.key) in RELAYED]
+        fit = [arrival for arrival in arrivals if self.channel(arrival) in RELAYED]
         if len(fit) < len(arrivals):
             self.complain(LiveError(f"{sample.key}: has what never takes the detour"))
         return fit
@@ -338,7 +347,10 @@ class Pulse:
         self.place, self._offsets = place, offsets
         hears = (place.stamper,) if hears is None else hears
         keys = place.keys
-        self._heard = (*(keys.beat(*one) for one in hears), *map(keys.beats, nodes))
+        self._heard = (
+            *(keys.of(channels.BEAT, *one) for one in hears),
+            *(keys.of(channels.BEATS, node) for node in nodes),
+        )
         self.detector = FailureDetector(place.who, place.patience_ns)
         self._state, self._holds = state, holds
         self._every_ns = every * place.period_ns
@@ -353,7 +365,7 @@ class Pulse:
         self._rivals: dict[str, int] = {}
         self._complained = 0
         self._repeat_until_ns = -NEVER_NS
-        self._key = keys.beat(place.node, place.who)
+        self._key = keys.of(channels.BEAT, place.node, place.who)
         self._returned = keys.detour(self._key)
         # Last direct beats by key: an equal copy from the detour is skipped without decoding.
         self._detoured: dict[str, bytes] = {}
@@ -375,7 +387,7 @@ class Pulse:
             return []
         keys, sent_ns, new = self.place.keys, beats[0].sent_ns, []
         direct = keys.came_directly(sample.key)
-        alone = direct and keys.word(sample.key) == "beat"
+        alone = direct and self.place.channel(sample) is channels.BEAT
         for beat in beats:
             if differs := self._differs(beat):
                 self._note_stranger(beat.who, differs, now_ns)
@@ -446,7 +458,7 @@ class Pulse:
 
     def hears(self, sample: Arrival) -> bool:
         """Whether a message has beats."""
-        return self.place.keys.word(sample.key) in BEATS
+        return self.place.channel(sample) in (channels.BEAT, channels.BEATS)
 
     def wake(self, now_ns: int) -> int:
         """Make the beat if it is due; return the instant of the next one.
@@ -515,7 +527,7 @@ class Pulse:
         if slots is not None:
             slots.write(encode(beat))
         if alone or slots is None:
-            self.place.put_twice(self._key, beat)
+            self.place.send(channels.BEAT, beat, beat.node, beat.who)
 
     def _repeated(self, now_ns: int) -> str:
         """Return the last complaint if it is at most `REPEATED_NS` old; else an empty string."""

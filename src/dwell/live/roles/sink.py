@@ -9,6 +9,7 @@ from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.stage import CellActuator, Message
+from dwell.live.wire import channels
 from dwell.live.wire.messages import ACTUATED, BEHIND, NOT_APPLIED, STALE, Completion, Header
 from dwell.live.wire.payloads import read_payload
 from dwell.live.wire.transport import Arrival
@@ -64,7 +65,7 @@ class Sink:
     def subscriptions(self) -> Iterable[str]:
         """Key expressions to subscribe to."""
         yield from self.pulse.subscriptions()
-        yield self.place.keys.command(self.task)
+        yield self.place.keys.of(channels.COMMAND, self.task)
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a command or a beat."""
@@ -86,7 +87,7 @@ class Sink:
         self.counts[outcome] += 1
         ways = header.hops, self.place.node, group_ns, rested
         done = Completion(header.stamp, self.task, now_ns, outcome, *ways)
-        self.place.put_twice(self.place.keys.done(self.task), done)
+        self.place.send(channels.DONE, done, self.task)
 
     def age_ns(self, header: Header, now_ns: int) -> int:
         """Upper bound of the time since a cycle's release, with the clocks' error bound."""

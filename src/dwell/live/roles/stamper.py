@@ -13,6 +13,7 @@ from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
 from dwell.live.roles.latencies import Intervals
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
+from dwell.live.wire import channels
 from dwell.live.wire.continuity import CLAIMS, RESERVED, RunClaims, SetbackDetector
 from dwell.live.wire.keys import CONTROLLER
 from dwell.live.wire.messages import (
@@ -149,15 +150,13 @@ class Stamper:
 
     def subscriptions(self) -> Iterable[str]:
         """Key expressions to subscribe to."""
-        keys = self.place.keys
         yield from self.pulse.subscriptions()
-        yield from (keys.done("*"), keys.ended(), keys.carried())
-        yield keys.order()
-        yield keys.frame()
+        yield from self.place.channels_to("stamper")
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a message."""
-        if sample.key == self.place.keys.carried():
+        channel = self.place.channel(sample)
+        if channel is channels.CARRIED and self.place.keys.came_directly(sample.key):
             for arrival in self.place.around(sample):
                 self.receive(arrival, now_ns)
             return
@@ -166,15 +165,15 @@ class Stamper:
                 self._heard(*beat)
             return
         try:
-            match word := self.place.keys.word(sample.key):
-                case "order":
-                    self._order(self.place.read(sample, Order, lambda _: CONTROLLER), now_ns)
-                case "frame":
+            match channel:
+                case channels.ORDER:
+                    self._order(self.place.read(channels.ORDER, sample), now_ns)
+                case channels.FRAME:
                     self._frame(now_ns)
-                case "done" | "ended":
+                case channels.DONE | channels.ENDED:
                     done = self.place.completion(sample)
                     self._completed(done, now_ns)
-                    applied = word == "done" and done.outcome == ACTUATED
+                    applied = channel is channels.DONE and done.outcome == ACTUATED
                     if applied and done.stamp.run == self.run:
                         direct = self.place.keys.came_directly(sample.key)
                         self.intervals.completed(done, now_ns, newest=self.cycle, direct=direct)
@@ -268,7 +267,7 @@ class Stamper:
                 self._accept(order)
             answer = self._answer(order, refused, now_ns)
             self._answered = order.controller, order.number, answer
-        self.place.put_twice(self.place.keys.accepted(), answer)
+        self.place.send(channels.ACCEPTED, answer)
 
     @property
     def _next(self) -> int:
@@ -402,7 +401,7 @@ class Stamper:
         missing = any(age_ns is None or age_ns > late_ns for age_ns in ages)
         if missing and not 0 <= now_ns - self._asked_ns < period_ns:
             self._asked_ns = now_ns
-            self.place.transport.put(self.place.keys.missed(), b"")
+            self.place.transport.put(self.place.keys.of(channels.MISSED), b"")
         due_ns = [now_ns + late_ns - age_ns for age_ns in ages if age_ns and age_ns <= late_ns]
         return min(due_ns, default=now_ns + period_ns) + 1
 
@@ -454,7 +453,7 @@ class Stamper:
         self._send(stamp, here=True, elsewhere=early is None)
         intervals = self.intervals.take_unreported()
         stamped = Stamped(**asdict(stamp), intervals=intervals, group_ns=group_ns)
-        self.place.transport.put(self.place.keys.stamped(), encode(stamped))
+        self.place.send(channels.STAMPED, stamped)
         if self._early and self.timer:
             self._ahead = self._stamp(self.cycle, released_ns + self.place.period_ns)
             self._send(self._ahead, here=False, elsewhere=True)
@@ -470,7 +469,7 @@ class Stamper:
         header = encode(Header(stamp, STAMPER, place.node, "none", seal=place.stamped(stamp)))
         for task, node, kind in self.routes.destinations(STAMPER, stamp):
             if here if node == place.node else elsewhere:
-                place.transport.put(place.keys.inputs(task, node, kind), b"", header)
+                place.transport.put(place.keys.of(channels.INPUT, task, node, kind), b"", header)
 
     def _stamp(self, cycle: int, released_ns: int) -> Stamp:
         wanted = self.guard.probation.wanted if self.course.by_guard else None

@@ -8,6 +8,7 @@ import os
 import re
 import threading
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from dwell.errors import LiveError, installing
@@ -22,7 +23,6 @@ from dwell.live.ros2.rmw_zenoh import (
     RosEndpoint,
     RosNode,
     Topic,
-    TopicQos,
     gid,
     node_name,
     read_token,
@@ -133,9 +133,8 @@ class RosSession:
         settings = self.settings
         self.types = types_of(settings, self._place.folder)
         self.topic = Topic(settings.resolved, settings.type, self.types.hash(settings.type))
-        qos = QOS[settings.qos]
-        depth = settings.depth or qos.depth
-        self.qos = TopicQos(qos.reliable, qos.transient_local, depth)
+        usual = QOS[settings.qos]
+        self.qos = replace(usual, depth=settings.depth or usual.depth)
         self.domain = domain_of(settings)
 
     def open(self) -> None:
@@ -224,6 +223,12 @@ class RosSession:
         self.notes = tuple(matching.notes(self.endpoint, others))
         for line in (*self.faults, *self.notes):
             self.warn(line)
+
+    @property
+    def note(self) -> str:
+        """Trouble, or else faults and notes, with the topic; empty if there are none."""
+        note = self.trouble or "; ".join((*self.faults, *self.notes))
+        return note and f"{self.settings.resolved}: {note}"
 
     @property
     def others(self) -> list[RosEndpoint]:

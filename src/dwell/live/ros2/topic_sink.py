@@ -48,13 +48,6 @@ class Sink(CellActuator):
         self._session: RosSession | None = None
         self._zero: bytes | None = None
 
-    @classmethod
-    def of(cls, settings: RosCommands) -> Sink:
-        """Return the sink of an actuator of a cell file."""
-        made = cls(settings.topic, settings.type)
-        made.settings, made.stamp_from = settings, settings.stamp_from or ""
-        return made
-
     def placed(self, place: StagePlace) -> None:
         """Take the name of the ROS node."""
         self._place = place
@@ -110,7 +103,4 @@ class Sink(CellActuator):
     def report(self) -> StageReport:
         """Report a missing router as not ready."""
         session = self._session
-        if session is None:
-            return StageReport()
-        note = session.trouble or "; ".join((*session.faults, *session.notes))
-        return StageReport(not session.trouble, note and f"{self.settings.resolved}: {note}")
+        return StageReport() if session is None else StageReport(not session.trouble, session.note)

@@ -62,13 +62,6 @@ class Source(CellStage):
         self._stamp_age_ns: int | None = None
         self._session: RosSession | None = None
 
-    @classmethod
-    def of(cls, settings: RosTopic) -> Source:
-        """Return the source of a task of a cell file."""
-        made = cls(settings.topic, settings.type)
-        made.settings = settings
-        return made
-
     def placed(self, place: StagePlace) -> None:
         """Take the name of the ROS node and the limits of messages."""
         self._place = place
@@ -156,10 +149,8 @@ class Source(CellStage):
             return StageReport()
         age_ms = self._age_ms(newest)
         silent = newest is None or age_ms > max(self._place.max_age_ms, SILENT_NS / 1e6)
-        note = session.trouble or "; ".join((*session.faults, *session.notes))
-        if silent:
-            note = self._silence(age_ms)
-        return StageReport(not silent, note and f"{self.settings.resolved}: {note}", self.rates())
+        note = f"{self.settings.resolved}: {self._silence(age_ms)}" if silent else session.note
+        return StageReport(not silent, note, self.rates())
 
     def rates(self) -> TopicRates:
         """Return the rate of the topic, its jitter, and its lost messages."""

@@ -1,0 +1,91 @@
+"""Joins: the inputs of one cycle become a job when the last of them has arrived."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from dwell.live.wire.messages import Header, Hop
+from dwell.model.pipeline import LONGEST_DEADLINE
+
+#: Largest number of cycles that wait for the rest of their inputs: those of the longest deadline.
+MAX_JOINS = LONGEST_DEADLINE
+#: Header, payload and time of arrival by source task.
+Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
+
+
+@dataclass(slots=True)
+class Job:
+    """A complete set of inputs of one cycle; `header` is the header of one of them."""
+
+    header: Header
+    inputs: Inputs
+    shadow: bool
+
+    @property
+    def arrived_ns(self) -> int:
+        """Arrival of the last input."""
+        return max(at_ns for _, _, at_ns in self.inputs.values())
+
+    @property
+    def order(self) -> tuple[int, int]:
+        """Run and cycle; they grow with every job."""
+        return self.header.stamp.key
+
+    @property
+    def headers(self) -> Iterable[Header]:
+        """Headers of the inputs."""
+        return (header for header, _, _ in self.inputs.values())
+
+    def hops(self) -> tuple[Hop, ...]:
+        """Return all jobs upstream in this cycle, each once."""
+        hops = (hop for header, _, _ in self.inputs.values() for hop in header.hops)
+        return tuple({(hop.task, hop.node): hop for hop in hops}.values())
+
+
+@dataclass(slots=True)
+class Joins:
+    """Inputs of incomplete cycles; a complete cycle evicts earlier ones whose deadline has passed.
+
+    These are `open_cycles` or more before it. `drop` gets the headers of inputs that are too late
+    or evicted.
+    """
+
+    sources: frozenset[str]
+    drop: Callable[[Iterable[Header]], None]
+    open_cycles: int = 1
+    waiting: dict[tuple[int, int], Inputs] = field(default_factory=dict)
+    newest: tuple[int, int] = (-1, -1)
+    # Complete cycles among the newest `open_cycles`.
+    done: set[tuple[int, int]] = field(default_factory=set)
+
+    @property
+    def _last_over(self) -> tuple[int, int]:
+        """The last cycle whose inputs are too late."""
+        run, number = self.newest
+        return run, number - self.open_cycles
+
+    def add(self, header: Header, payload: bytes, at_ns: int) -> Inputs | None:
+        """Add an input; return the set of its cycle's inputs if it is now complete."""
+        cycle = header.stamp.key
+        late = cycle <= self._last_over or cycle in self.done
+        if late or header.source not in self.sources:
+            self.drop([header])
+            return None
+        inputs = self.waiting.setdefault(cycle, {})
+        inputs.setdefault(header.source, (header, payload, at_ns))
+        if len(inputs) < len(self.sources):
+            if len(self.waiting) > MAX_JOINS:
+                self._evict(min(self.waiting))
+            return None
+        self.newest = max(self.newest, cycle)
+        del self.waiting[cycle]
+        last = self._last_over
+        self.done = {other for other in (*self.done, cycle) if other > last}
+        for other in [other for other in self.waiting if other <= last]:
+            self._evict(other)
+        return inputs
+
+    def _evict(self, cycle: tuple[int, int]) -> None:
+        self.drop(header for header, _, _ in self.waiting.pop(cycle).values())
