@@ -15,15 +15,12 @@ Status advance(const Tables& tables) {
   return status;
 }
 
-template <bool has_rates>
+// Cells with several rates are simulated as if they had quotas: two instances fewer.
+template <bool is_plain>
 Status advance(const Tables& tables) {
-  const bool is_plain = tables.cells.size == 1 && tables.log.size == 0;
-  if (tables.quotas.size > 0) {
-    return is_plain ? advance<true, true, has_rates>(tables)
-                    : advance<true, false, has_rates>(tables);
-  }
-  return is_plain ? advance<false, true, has_rates>(tables)
-                  : advance<false, false, has_rates>(tables);
+  if (tables.clock[0].has_rates) return advance<true, is_plain, true>(tables);
+  return tables.quotas.size > 0 ? advance<true, is_plain, false>(tables)
+                                : advance<false, is_plain, false>(tables);
 }
 
 // Marks the instants of tasks and flows that do not run in a cycle as not due.
@@ -48,8 +45,8 @@ using namespace dwell;
 
 // Continues a simulation; returns a Status.
 DWELL_EXPORT i32 dwell_advance(const Tables* tables) noexcept {
-  if (tables->clock[0].has_rates) return advance<true>(*tables);
-  return advance<false>(*tables);
+  const bool is_plain = tables->cells.size == 1 && tables->log.size == 0;
+  return is_plain ? advance<true>(*tables) : advance<false>(*tables);
 }
 
 // Adds an event of the caller; the queue must have room.
