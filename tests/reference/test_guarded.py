@@ -24,7 +24,17 @@ from dwell.model import (
     Task,
 )
 from tests.cells.generated import make_problem
-from tests.reference.test_against import EXAMPLES, LONGER, ONE_IN, Case, examine
+from tests.reference.test_against import (
+    EXAMPLES,
+    LONGER,
+    ONE_IN,
+    Case,
+    differences,
+    examine,
+    make_guarded,
+    play,
+    reference,
+)
 
 NODES = ("R", "E", "F")
 CANDIDATES = ("LOC", "ONE", "TWO", "ALL")
@@ -171,3 +181,18 @@ def test_the_guard_of_failing_cells_equal_to_the_nanosecond(seeds: range) -> Non
     found = {seed: examine(_Maker(seed).case(), 0) for seed in seeds}
     failures = [f"seed {seed}: {differing[:3]}" for seed, differing in found.items() if differing]
     assert not failures, f"{len(failures)} of {len(seeds)} differ:\n" + "\n".join(failures[:10])
+
+
+def test_a_cycle_that_completes_after_many_others_is_the_newest() -> None:
+    # An overloaded cell: cycles complete more than ten seconds after their release.
+    case = make_guarded(0, ("fifo", "priority"), orders=True)
+    pipeline, controller = case.problem.pipeline, case.problem.controller
+    tasks = {**pipeline.tasks, "T0": replace(pipeline.tasks["T0"], offset_ms=430.0)}
+    problem = replace(
+        case.problem,
+        pipeline=replace(pipeline, tasks=tasks),
+        controller=replace(controller, decide_cycles=1),
+    )
+    real = dwell.draw(problem, scenario="disturbed", seed=0, windows=case.real.windows)
+    case = replace(case, problem=problem, real=real)
+    assert list(differences(case, play(case), reference(case), 0)) == []

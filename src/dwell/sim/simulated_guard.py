@@ -167,8 +167,8 @@ class SimulatedGuard:
     def _first_to_tell(self, stop: int, now: int) -> int:
         """Return the first cycle before `stop` that the guard still needs.
 
-        It needs no cycle that is too old, and none that precedes a completed cycle or shadow of the
-        same candidate.
+        It needs no cycle that is too old, except the newest completed one, and none that precedes a
+        completed cycle or shadow of the same candidate.
         """
         oldest = self._released(now - max(EVIDENCE_NS, self.guard.patience_ns))
         stamps = self._sent(oldest, stop)
@@ -180,7 +180,9 @@ class SimulatedGuard:
             missing = np.flatnonzero((sent & ~heard).any(axis=0))[:1]
             matter = completed if len(completed) else missing
             first = min([first, *(oldest + matter).tolist()])
-        return first
+        begin = self.guard.newest + 1
+        late = np.flatnonzero(self._heard_ns(begin, oldest)[0] <= now)
+        return min(first, begin + int(late[-1])) if len(late) else first
 
     def _sent(self, first: int, stop: int) -> NDArray[np.int16]:
         """Return the candidates of cycles and of the shadows that count, -1 for none."""
