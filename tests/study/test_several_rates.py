@@ -14,7 +14,7 @@ from tests.cli.small_cell import call, read_json
 
 ROOT = Path(__file__).parents[2]
 #: Cells that have a page.
-CELLS = ("inner-loop", "chunks")
+CELLS = ("inner-loop", "chunks", "autoware")
 
 
 def block(name: str, language: str) -> str:
