@@ -46,9 +46,9 @@ USES: dict[str, dict[str, str]] = {
     },
     "tests/live/roles/test_offsets.py": {"_pairs": BOUND},
     "tests/live/roles/test_recording.py": {"_journal": RACE},
-    "tests/live/small_world.py": {"_jobs": BOUND, "_forked": BOUND, "_joins": BOUND, "_move": RACE},
+    "tests/live/small_world.py": {"_jobs": BOUND, "_joins": BOUND, "_move": RACE},
     "tests/live/test_fan_in.py": {"_source": SEEN, "_last": SEEN},
-    "tests/live/test_faults.py": {"_awaited": RACE, "_partial": RACE},
+    "tests/live/test_faults.py": {"_partial": RACE},
     "tests/live/test_flood.py": {"_of": BOUND, "_read": BOUND},
     "tests/live/test_modes.py": {"_do": SEEN},
     "tests/live/test_seeded_faults.py": {
@@ -65,7 +65,6 @@ USES: dict[str, dict[str, str]] = {
         "_charge": RACE,
         "_keys": PLANTED,
         "_verifies": COST,
-        "_asked": SEEN,
         "_good": BOUND,
     },
     "tests/live/wire/test_messages.py": {

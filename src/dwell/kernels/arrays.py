@@ -468,7 +468,7 @@ class _Layout:
     def _add_cell(self, index: int, problem: Problem, real: Realisation) -> None:
         pipeline, release_ns, part = problem.pipeline, real.release_ns, self.parts[index]
         resources = problem.fabric.resources.values()
-        names, flows = list(pipeline.tasks), ordered_flows(pipeline)
+        flows = ordered_flows(pipeline)
         due_ns, grace_ns = close_after_ns(problem)
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
@@ -505,6 +505,11 @@ class _Layout:
             self.server_row[self.node_row[index, one.node], one.kind or None] for one in resources
         ]
         self.capacity += [one.capacity for one in resources]
+        self._add_pipeline(pipeline, flows)
+
+    def _add_pipeline(self, pipeline: Pipeline, flows: Sequence[Flow]) -> None:
+        """Add the tasks of a cell, and its flows in the order of `ordered_flows`."""
+        names = list(pipeline.tasks)
         flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
         self.rows["flows"] += [
             {

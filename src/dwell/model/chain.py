@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
 
 from dwell.errors import Fault
 from dwell.model.bounds import Bound
 from dwell.model.declaration import declared, key
-
-if TYPE_CHECKING:
-    from dwell.model.pipeline import Flow
+from dwell.model.task_rates import Edge
 
 MAX_AGE_MS = Bound(0, above=True)
 
@@ -31,7 +28,7 @@ class Chain:
 
 
 def chain_faults(
-    chains: Mapping[str, Chain], tasks: Iterable[str], flows: Iterable[Flow]
+    chains: Mapping[str, Chain], tasks: Iterable[str], flows: Iterable[Edge]
 ) -> Iterator[Fault]:
     """Yield the faults of chains between known tasks that no flows connect."""
     known, all_flows = {*tasks}, list(flows)
@@ -46,7 +43,7 @@ def chain_faults(
             )
 
 
-def behind(task: str, flows: Iterable[Flow]) -> set[str]:
+def behind(task: str, flows: Iterable[Edge]) -> set[str]:
     """Return the tasks that flows lead to from a task, the task itself excluded."""
     found, new, known = set[str](), {task}, list(flows)
     while new:

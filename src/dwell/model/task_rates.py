@@ -6,18 +6,39 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from graphlib import TopologicalSorter
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from dwell.errors import Fault
-
-if TYPE_CHECKING:
-    from dwell.model.pipeline import Flow, Task
 
 #: Largest common multiple of the rates of a pipeline, cycles.
 MOST_COMMON_CYCLES = 100_000
 
 
-def rates_of(tasks: Mapping[str, Task], flows: Iterable[Flow]) -> dict[str, int]:
+class Edge(Protocol):
+    """A flow: its tasks, and whether the target samples it."""
+
+    @property
+    def source(self) -> str:
+        """Task that sends."""
+
+    @property
+    def target(self) -> str:
+        """Task that receives."""
+
+    @property
+    def sampled(self) -> bool:
+        """Whether the target does not wait for it."""
+
+
+class Rated(Protocol):
+    """A task, which may state its rate."""
+
+    @property
+    def every(self) -> int | None:
+        """Cycles from one run to the next; None if not stated."""
+
+
+def rates_of(tasks: Mapping[str, Rated], flows: Iterable[Edge]) -> dict[str, int]:
     """Return the rate of each task, cycles: it runs in the cycles 0, n, 2n, ...
 
     A task without waited inputs has its own `every`; each other task has the slowest rate of its
@@ -33,7 +54,7 @@ def rates_of(tasks: Mapping[str, Task], flows: Iterable[Flow]) -> dict[str, int]
     return {name: rates[name] for name in tasks}
 
 
-def rate_faults(tasks: Mapping[str, Task], flows: Sequence[Flow]) -> Iterator[Fault]:
+def rate_faults(tasks: Mapping[str, Rated], flows: Sequence[Edge]) -> Iterator[Fault]:
     """Yield the faults of the rates of valid tasks, whose flows have no loops."""
     rates = rates_of(tasks, flows)
     for name, task in tasks.items():
@@ -73,7 +94,7 @@ def _bad_join(every: int | None, inputs: Mapping[str, int]) -> str:
     return ""
 
 
-def _ordered(tasks: Iterable[str], flows: Iterable[Flow]) -> Iterable[str]:
+def _ordered(tasks: Iterable[str], flows: Iterable[Edge]) -> Iterable[str]:
     graph: TopologicalSorter[str] = TopologicalSorter(dict.fromkeys(tasks, ()))
     for flow in flows:
         graph.add(flow.target, flow.source)
