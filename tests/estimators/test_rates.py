@@ -111,6 +111,15 @@ def test_what_is_not_due_is_no_loss() -> None:
         assert estimated.mean() == pytest.approx(price.violation_rate, abs=0.02)
 
 
+def test_a_sampled_message_that_no_shadow_gets_is_no_loss() -> None:
+    """With control alone on E, its shadows do not get the detections, which both share."""
+    cell = document(controller={"shadow_fraction": 0.1})
+    cell["candidates"] = {"LOC": {"detect": "R", "control": "R"}}
+    cell["candidates"]["FAR"] = {"detect": "R", "control": "E"}
+    run = simulate(from_document(cell), policy="LOC", estimator="corrected", seed=1, windows=30)
+    assert (run.decisions["est_violation_rate_FAR"].to_numpy() < 0.2).all()
+
+
 def test_the_controller_leaves_a_slow_node() -> None:
     slow = [{"node": "E", "at_s": 4, "stress_threads": 60}]
     problem = from_document(document(scenarios={"slow": slow}, controller={"initial": "ALL"}))

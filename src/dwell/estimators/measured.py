@@ -275,8 +275,11 @@ class Meter:
         parts: list[Part | None] = [
             Site(name, placement[name]) if name in tasks else None for name in self._pipeline.tasks
         ]
+        # No shadow gets the sampled messages of shared jobs.
         parts += [
-            message_of(flow.source, flow.target, placement) if flow.target in tasks else None
+            message_of(flow.source, flow.target, placement)
+            if flow.target in tasks and (flow.source in tasks or not flow.sampled)
+            else None
             for flow in self._pipeline.flows
         ]
         return [-1 if part is None else self._number[part] for part in parts]
