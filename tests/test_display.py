@@ -63,8 +63,8 @@ LINES, CHARACTERS = 19, 700
 SCREEN_LINES, SCREEN_COLUMNS = 24, 80
 #: Not made here: tuples of a few numbers and names.
 FEW_NUMBERS = {
-    *("Endpoint", "Episodes", "Family", "Move", "PairedDifference", "PairedMedian", "Phase"),
-    *("QoS", "Support"),
+    *("Chain", "Endpoint", "Episodes", "Family", "Move", "PairedDifference", "PairedMedian"),
+    *("Phase", "QoS", "Support"),
 }
 
 

@@ -287,7 +287,7 @@ def test_a_long_list_of_values_still_names_a_folder(cell: Path) -> None:
             ["window_cycles=0", "nodes.E.cores=0"],
             ["--set window_cycles: 0", "--set nodes.E.cores:"],
         ),
-        (["deadline_ms=30"], ["--set deadline_ms: "]),
+        (["deadline_ms=3000"], ["--set deadline_ms: "]),
         (["controller.policy=dpt"], ["--set controller.policy: "]),
         (
             ["controller.decide_cycles=10", "window_cycles=5"],

@@ -22,6 +22,7 @@ from dwell.live.roles.role import RolePlace
 from dwell.live.roles.sink import Sink
 from dwell.live.roles.stamper import Stamper
 from dwell.live.roles.worker import Worker
+from dwell.live.wire import channels
 from dwell.live.wire.continuity import RESERVED, RunClaims
 from dwell.live.wire.messages import ACTUATED, Accepted, Hop, Order, Stamped
 from dwell.live.wire.routing import Routes
@@ -194,9 +195,9 @@ def says_it_ran_elsewhere(patch: pytest.MonkeyPatch) -> None:
 
 
 def says_what_nobody_reads(patch: pytest.MonkeyPatch) -> None:
-    def torn(sealed: Any, self: RolePlace, key: str, message: Any) -> bytes:
-        data: bytes = sealed(self, key, message)
-        return data[:-1] if "/done/" in key else data
+    def torn(sealed: Any, self: RolePlace, channel: Any, message: Any) -> bytes:
+        data: bytes = sealed(self, channel, message)
+        return data[:-1] if channel is channels.DONE else data
 
     around(patch, RolePlace, "sealed", torn)
 
