@@ -33,7 +33,7 @@ def measure(quick: bool) -> Section:
             Figure("building the kernel and a wheel, CPU time", spent, "s", Goal(high=10))
         )
         (wheel,) = (copy / "dist").glob("*.whl")
-        figures.append(Figure("wheel", [wheel.stat().st_size / MB], "MB", Goal(high=1.4)))
+        figures.append(Figure("wheel", [wheel.stat().st_size / MB], "MB", Goal(high=1.5)))
         notes.append(wheel.name)
     return Section("Installing", figures, notes)
 
