@@ -10,7 +10,7 @@ import typer
 
 import dwell
 from dwell.cli.options import CellArgument, Json, Scenario, Seed, Traces, flag, option
-from dwell.cli.output import aligned, print_json
+from dwell.cli.output import aligned, print_json, with_error
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -135,9 +135,9 @@ def _summary(
         rows.append(
             [
                 name,
-                _with_error(one.cost, error, 3),
-                _with_error(one.qos.l95_ms, l95_error, 1),
-                _with_error(one.qos.violation_rate * 100, rate_error * 100, 2),
+                with_error(f"{one.cost:.3f}", error),
+                with_error(f"{one.qos.l95_ms:.1f}", l95_error),
+                with_error(f"{one.qos.violation_rate * 100:.2f}", rate_error * 100),
                 *(f"{one.qos.utilisation[resource] * 100:.0f}" for resource in resources),
             ]
         )
@@ -177,7 +177,3 @@ def _found(ranking: Ranking, names: Sequence[str]) -> str:
     if ranking.is_tie:
         return f"tie: J of {names[1]} is {gain:.2g} ± {error:.2g} above J of {names[0]} ({counts})"
     return f"J of {names[1]} is {gain:.2g} ± {error:.2g} above J of {names[0]} ({counts})"
-
-
-def _with_error(mean: float, error: float, places: int) -> str:
-    return f"{mean:.{places}f} ± {error:.{places}f}" if error else f"{mean:.{places}f}"

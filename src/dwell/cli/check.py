@@ -12,7 +12,7 @@ import typer
 import dwell
 from dwell.cli.completion import nodes
 from dwell.cli.options import CellArgument, Insecure, Json, Keys, Scenario, Traces
-from dwell.cli.output import aligned, print_json, warn
+from dwell.cli.output import aligned, print_json, warn, with_error
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
@@ -184,8 +184,8 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
     rows = [
         [
             name,
-            _with_error(milliseconds(price.l95_ms), price.l95_error_ms),
-            _with_error(rate.number(price.violation_rate), price.violation_error * 100),
+            with_error(milliseconds(price.l95_ms), price.l95_error_ms),
+            with_error(rate.number(price.violation_rate), price.violation_error * 100),
             *(f"{price.own[one] * 100:.0f}" for one in resources),
         ]
         for name, price in prices.items()
@@ -249,8 +249,3 @@ def _notes(price: Price) -> Iterator[str]:
         yield f"lost in {share}: more than 5 % of their cycles never complete"
     if not price.is_settled:
         yield f"not settled after {price.cycles} cycles: the means of the two halves differ"
-
-
-def _with_error(mean: str, error: float) -> str:
-    """Return a mean, with a nonzero standard error to the mean's last digit."""
-    return f"{mean} ± {error:.{len(mean.partition('.')[2])}f}" if error else mean

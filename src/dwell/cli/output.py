@@ -46,6 +46,11 @@ def aligned(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(lines)
 
 
+def with_error(mean: str, error: float) -> str:
+    """Return a mean, with a nonzero standard error to the mean's last digit."""
+    return f"{mean} ± {error:.{len(mean.partition('.')[2])}f}" if error else mean
+
+
 def block(share: float) -> str:
     """Return a block that is so high, from 0 to 1, for a line of them."""
     return BLOCKS[min(max(int(share * len(BLOCKS)), 0), len(BLOCKS) - 1)]

@@ -8,26 +8,28 @@ returned. The kernel simulates all others, on the same samples, so the result is
 from __future__ import annotations
 
 import math
+from bisect import insort
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from typing import NamedTuple
 
-from dwell.cost import cost
+import numpy as np
+
+from dwell.cost import cost, price
 from dwell.errors import PlacementError, SimulationError
 from dwell.estimators.any_placement import AnyPlacement, Measured
 from dwell.estimators.cost_bounds import CostBounds, Partial
+from dwell.estimators.prices import DISTURBED, MOST_CYCLES
 from dwell.estimators.slow_processes import mean_and_error
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import Constant
 from dwell.model.qos import QoS
 
-#: Windows of a scenario with disturbances, the default length of a run.
-WINDOWS = 300
-#: Cycles of the first search, and of the last, until the best placements differ.
-FIRST_CYCLES, MOST_CYCLES = 1_000, 100_000
+#: Cycles of the first search, which are doubled until the best placements differ.
+FIRST_CYCLES = 1_000
 #: Most partial placements that a search looks at.
 MOST_NODES = 1_000_000
 #: Relative rounding of a lower bound of J.
@@ -178,7 +180,7 @@ def rank_until_apart(
 def _sample(problem: Problem, scenario: str, cycles: int, seed: int) -> AnyPlacement:
     """Sample a scenario; its windows are as long as the cell's if `cycles` allows."""
     if problem.scenario(scenario):
-        return AnyPlacement(problem, scenario, seed=seed, windows=WINDOWS)
+        return AnyPlacement(problem, scenario, seed=seed, windows=DISTURBED)
     windows = max(cycles // problem.window_cycles, 1)
     windows = next(number for number in range(windows, 0, -1) if cycles % number == 0)
     width = cycles // windows
@@ -214,7 +216,8 @@ class _Search:
         self._twins = tuple(twins(problem)) if constant else ()
         self._before = {node: before for group in self._twins for before, node in pairwise(group)}
         self._measured: dict[Placement, tuple[Ranked, Measured]] = {}
-        self._limit = math.inf
+        #: J of the best placements so far, at most as many as are returned, ascending.
+        self._lowest: list[float] = []
         self._pruned: Counter[str] = Counter()
         self._looked = 0
         self._left = math.inf
@@ -280,14 +283,13 @@ class _Search:
             found.append(
                 (Ranked(placement, qos, cost(qos, placement, placement, objective)), measured)
             )
-        self._measured[placement] = max(found, key=lambda one: one[0].cost)
-        if len(self._measured) >= self._top:
-            costs = sorted(one.cost for one, _ in self._measured.values())
-            self._limit = costs[self._top - 1]
+        self._measured[placement] = largest = max(found, key=lambda one: one[0].cost)
+        insort(self._lowest, largest[0].cost)
+        del self._lowest[self._top :]
 
     def _canonical(self, nodes: Mapping[str, str]) -> Placement:
         """Return the placement that is first in order among those that differ by twins only."""
-        names = dict(zip(self._problem.fabric.nodes, self._problem.fabric.nodes, strict=True))
+        names = {node: node for node in self._problem.fabric.nodes}
         for group in self._twins:
             used = [
                 node
@@ -305,12 +307,13 @@ class _Search:
         (_, one), (_, other) = (self._measured[ranked.placement] for ranked in best[:2])
         if len(one.l95_ms) != len(other.l95_ms):
             return best[1].cost - best[0].cost, math.inf
-        by_window = objective.weights.latency * (
-            other.l95_ms - one.l95_ms
-        ) / objective.targets.latency_ms + objective.weights.violations * (
-            other.violation_rate - one.violation_rate
+        # The utilisation of a placement is a mean over all windows, and has no error.
+        none = np.zeros_like(one.l95_ms)
+        first, second = (
+            price(of.l95_ms, of.violation_rate, none, none, none, none, objective)
+            for of in (one, other)
         )
-        return best[1].cost - best[0].cost, mean_and_error(by_window)[1]
+        return best[1].cost - best[0].cost, mean_and_error(second - first)[1]
 
     def _rank(self, one: Ranked) -> tuple[float, list[int]]:
         nodes = list(self._problem.fabric.nodes)
@@ -318,9 +321,9 @@ class _Search:
 
     def _exceeds(self, bound: float) -> bool:
         """Whether a bound is above J of the last placement to return."""
-        if len(self._measured) < self._top:
+        if len(self._lowest) < self._top:
             return bound == math.inf
-        return bound > self._limit * (1.0 + ROUNDING) + ROUNDING
+        return bound > self._lowest[-1] * (1.0 + ROUNDING) + ROUNDING
 
     def _children(self, one: _Open) -> Iterator[_Open]:
         """Yield the partial placements with one more task."""
