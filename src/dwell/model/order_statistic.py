@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 Number = TypeVar("Number", bound=np.generic)
+Count = TypeVar("Count", int, NDArray[np.int64])
 
 
-def rank_of(percent: int, count: int) -> int:
+def rank_of(percent: int, count: Count) -> Count:
     """Return ceil(percent n / 100), in integers: 0.95 * n is not exact."""
     return -(-percent * count // 100)
 

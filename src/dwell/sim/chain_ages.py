@@ -10,6 +10,7 @@ from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.model import Chain, Pipeline
 from dwell.model.number_arrays import Floats, Ints
+from dwell.model.order_statistic import rank_of
 
 #: Origin of a job that descends from no cycle.
 NO_ORIGIN = np.iinfo(np.int64).max
@@ -84,7 +85,7 @@ def age_l95_ms(ages_ns: Ints) -> Floats:
     is_known = ages_ns != NO_AGE
     count = is_known.sum(axis=1)
     ordered = np.sort(np.where(is_known, ages_ns / 1e6, np.inf), axis=1)
-    rank = np.maximum((19 * count + 19) // 20, 1)
+    rank = np.maximum(rank_of(95, count), 1)
     l95: Floats = np.take_along_axis(ordered, rank[:, None] - 1, axis=1)[:, 0]
     return l95
 
