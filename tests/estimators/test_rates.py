@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import dwell
 from dwell import simulate
 from dwell.cellfile.cell import from_document
-from dwell.errors import SimulationError
 from dwell.estimators import warnings_of
 from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.measured import Site
@@ -77,11 +75,6 @@ def test_the_controller_leaves_a_slow_node() -> None:
     problem = from_document(inner_loop(scenarios={"slow": slow}, controller={"initial": "ALL"}))
     run = simulate(problem, scenario="slow", policy="dtp", seed=1, windows=40)
     assert run.windows["placement"].to_list()[-1] != "ALL"
-
-
-def test_the_search_of_placements_refuses_rates() -> None:
-    with pytest.raises(SimulationError, match="every"):
-        dwell.search(from_document(inner_loop()), cycles=40)
 
 
 def warned(document: dict[str, Any]) -> list[str]:

@@ -143,7 +143,7 @@ def phi_of_windows(fleet: Fleet, run: FleetRun) -> float:
         phi += weights.robot * float(windows["u_R"].mean()) / targets.robot
         shared += weights.edge / targets.edge / len(run.cells)
     (first,) = [*run.cells.values()][:1]
-    return phi + shared * float(first.windows["u_E"][1:].mean())
+    return phi + shared * float(np.mean(first.windows["u_E"][1:].to_numpy()))
 
 
 def test_phi_of_a_ledger_follows_from_runs_that_stay() -> None:
