@@ -126,7 +126,8 @@ def search(
     PlacementError
         If no placement is feasible; with the reasons.
     SimulationError
-        If `cycles`, `seed` or `top` is out of range, or tasks have several rates.
+        If `cycles`, `seed` or `top` is out of range, tasks have several rates, or the objective
+        has ages or a cap on misses.
     """
     ranking = rank(problem, (scenario,), cycles=cycles, seed=seed, top=top)
     return [(one.placement, one.qos, one.cost) for one in ranking.best]
@@ -149,6 +150,11 @@ def rank(
         raise SimulationError(
             f"cell {problem.name!r} has `every` or `sampled`, which the search of placements does "
             "not support; remove them, or list the candidates"
+        )
+    if name := problem.objective.beyond_cycles:
+        raise SimulationError(
+            f"cell {problem.name!r} has objective.{name}, which the search of placements does not "
+            "support; remove it, or list the candidates"
         )
     for name, value, least in (("cycles", cycles, 1), ("seed", seed, 0), ("top", top, 1)):
         if isinstance(value, bool) or value < least:
