@@ -87,6 +87,23 @@ def test_gaps_in_the_numbers_are_no_silence() -> None:
     assert mine.due_ns is None
 
 
+def test_idle_cycles_are_not_waited_for_but_shorten_a_rest() -> None:
+    mine = guard(h=4)
+    mine.released(0, 0, is_idle=True)
+    assert mine.due_ns is None
+    mine.released(1, P)
+    assert mine.due_ns == P + 3 * P
+    mine.adopt("LOC", fallback=True)
+    mine.released(2, 5 * P)
+    mine.released(3, 6 * P, is_idle=True)
+    mine.completed(2, 6 * P)
+    mine.released(4, 7 * P, is_idle=True)
+    mine.released(5, 8 * P)
+    assert mine.due_ns is None  # the rest has been four cycles, two of them idle
+    mine.released(6, 9 * P)
+    assert mine.due_ns == 12 * P
+
+
 def test_numbers_that_do_not_grow_and_completions_of_nothing_released_are_ignored() -> None:
     mine = guard()
     released(mine, [10, 11])

@@ -207,14 +207,13 @@ def make_case(
     orders: bool = False,
     in_order: bool = False,
     rates: bool = False,
-    idle: bool = True,
 ) -> Case:
     rng = Random(seed)
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
     if in_order:
         problem = with_order(problem, Random(seed), whole_ms=whole_ms)
     if rates:
-        problem = with_rates(problem, Random(f"{seed} rates"), idle=idle)
+        problem = with_rates(problem, Random(f"{seed} rates"))
     problem = with_deadline(problem, Random(f"{seed} deadline"), whole_ms=whole_ms)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
     names = tuple(random_stamps(rng, problem, windows))
@@ -301,7 +300,7 @@ def make_guarded(
 ) -> Case:
     """Make a case whose cell has a guard."""
     of = {"whole_ms": whole_ms, "orders": orders, "in_order": in_order, "rates": rates}
-    case = make_case(seed, schedulers, **of, idle=False)
+    case = make_case(seed, schedulers, **of)
     rng = Random(seed)
     names = list(case.problem.candidates)
     settings = replace(

@@ -58,6 +58,10 @@ class _Silence:
         while len(waiting) > kept and waiting[kept][1] <= at_ns - self.patience_ns:
             waiting.popleft()
 
+    def pass_over(self, cycle: int) -> None:
+        """Record the release of a cycle that it does not wait for."""
+        self.released = max(self.released, cycle)
+
     def complete(self, cycle: int) -> None:
         """Stop waiting for a completed cycle and all before it; ignore unknown cycles."""
         if self.newest < cycle <= self.released:
@@ -301,18 +305,19 @@ class Guard:
         recent = self.newest <= self._returned + self.probe_cycles
         return self._round.options(self.placement, self._carrier if recent else None)
 
-    def released(self, cycle: int, at_ns: int) -> None:
-        """Record the release of a stamped cycle."""
+    def released(self, cycle: int, at_ns: int, *, is_idle: bool = False) -> None:
+        """Record the release of a stamped cycle; an idle cycle only shortens a rest."""
         silence = self._silence
-        if not self._rest or cycle <= silence.released:
+        waits = True
+        if self._rest and cycle > silence.released:
+            self._rest -= 1
+            waits = self._spent_ns is None and not self.carries
+            if waits:
+                self._rest_last = cycle
+        if waits and not is_idle:
             silence.release(cycle, at_ns)
-            return
-        self._rest -= 1
-        if self._spent_ns is None and not self.carries:
-            silence.release(cycle, at_ns)
-            self._rest_last = cycle
         else:
-            silence.released = cycle
+            silence.pass_over(cycle)
 
     def passed(self, cycles: int) -> None:
         """Record cycles released before a completed one, in place of `released` for each."""
@@ -695,10 +700,11 @@ class CellGuard(Guard):
         Probes; the caller reports the wanted placement and the cycles completed under orders.
     """
 
-    __slots__ = ("failures", "presence", "probation")
+    __slots__ = ("_sink_rates", "failures", "presence", "probation")
 
     def __init__(self, problem: Problem, placement: str | None = None) -> None:
-        settings = problem.controller
+        settings, rates = problem.controller, problem.pipeline.rates
+        self._sink_rates = {rates[name] for name in problem.pipeline.sinks}
         super().__init__(
             settings.fallbacks,
             patience_ns=problem.guard_patience_ns,
@@ -709,9 +715,11 @@ class CellGuard(Guard):
         self.probation = Probation.of(problem)
 
     def sent(self, cycle: int, at_ns: int, candidate: str) -> None:
-        """Record the release of a cycle through a candidate."""
-        self.released(cycle, at_ns)
-        self.failures.released(candidate, cycle, at_ns)
+        """Record the release of a cycle through a candidate; a cycle without a sink is idle."""
+        is_idle = all(cycle % rate for rate in self._sink_rates)
+        self.released(cycle, at_ns, is_idle=is_idle)
+        if not is_idle:
+            self.failures.released(candidate, cycle, at_ns)
 
     def shadow_sent(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Record the release of the shadow of a cycle through a candidate."""

@@ -120,7 +120,7 @@ class Problem(Displayed):
         )
 
     def _require_due_sinks(self) -> None:
-        """Refuse windows in which a sink never runs, and features that do not support rates."""
+        """Refuse windows in which a sink never runs, and camera frames in cells with rates."""
         rates = self.pipeline.rates
         slowest = max(self.pipeline.sinks, key=lambda name: rates[name])
         bound = f"at least {rates[slowest]}, so that {slowest} runs in each window"
@@ -129,10 +129,6 @@ class Problem(Displayed):
         framed = self.live.release == "frames" and max(rates.values()) > 1
         bound = "timer in a cell with `every`, because each frame releases a cycle"
         require(not framed, "live.release", self.live.release, bound)
-        names = list(self.controller.fallbacks)
-        guarded = bool(names) and self.pipeline.has_idle_cycles
-        bound = "empty, because the guard does not support cycles in which no sink runs"
-        require(not guarded, "controller.fallbacks", names, bound)
 
     def _unplaced(self) -> list[Fault]:
         """Return faults of placements without an anchored task, which only cell files may omit."""
