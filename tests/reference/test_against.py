@@ -50,7 +50,7 @@ from tests.cells.generated import (
     random_problem,
     random_stamps,
 )
-from tests.cells.rated import with_rates
+from tests.cells.rated import with_chains, with_rates
 from tests.kernels.parts import attempt_uniform as kernel_uniform
 from tests.reference import guard as reference_guard
 from tests.reference import simulator as reference_simulator
@@ -311,6 +311,8 @@ def make_guarded(
         probe_cycles=rng.choice([1, 2, 2, 6]),
     )
     problem = replace(case.problem, controller=settings)
+    if rates:
+        problem = with_chains(problem, Random(f"{seed} chains"))
     windows = rng.randint(6, 14)
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     stamps = tuple(random_stamps(rng, problem, windows))
