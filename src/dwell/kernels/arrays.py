@@ -903,13 +903,18 @@ class _Layout:
 
 
 def back_ns(problem: Problem, placement: Placement) -> int:
-    """Time from a completion until the guard learns of it, nanoseconds.
-
-    A completion is a small message on the shortest path of links. The time is the least sum of mean
-    delays from the node of a sink to the stamper's node, for the farthest sink; 0 without a path.
-    """
-    pipeline, links = problem.pipeline, problem.fabric.links.values()
+    """Time from a completion until the guard learns of it, of the farthest sink, nanoseconds."""
+    pipeline = problem.pipeline
     sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
+    return way_back_ns(problem, sinks)
+
+
+def way_back_ns(problem: Problem, from_nodes: Collection[str]) -> int:
+    """Longest time that a small message takes from some nodes to the guard, nanoseconds.
+
+    The time is the least sum of mean delays of links to the stamper's node; 0 without a path.
+    """
+    links = problem.fabric.links.values()
     to_ms = {problem.stamper_node: 0.0}
     reached = [(0.0, problem.stamper_node)]
     while reached:
@@ -919,7 +924,7 @@ def back_ns(problem: Problem, placement: Placement) -> int:
             if link.target == node and further_ms < to_ms.get(link.source, np.inf):
                 to_ms[link.source] = further_ms
                 heapq.heappush(reached, (further_ms, link.source))
-    return round(max(to_ms.get(node, 0.0) for node in sinks) * 1e6)
+    return round(max(to_ms.get(node, 0.0) for node in from_nodes) * 1e6)
 
 
 def ordered_flows(pipeline: Pipeline) -> list[Flow]:

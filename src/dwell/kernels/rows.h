@@ -61,7 +61,8 @@ struct Crossing;  // of meter.cpp
 
 // A window ends `due_ns` after the release of its last cycle, or `grace_ns` after the release of
 // the next cycle, whichever is later. `wakes_ns` is the instant at which the guard is woken unless
-// it learns before that a cycle from `waited` on has completed. `patience_ns` is the guard's.
+// it learns before that a cycle from `waited` on has completed, or until `chain_due_ns`, at which
+// the patience for a chain may end. `patience_ns` is the guard's for cycles.
 // `decide_cycles` is the number of cycles between decisions that are more frequent than windows; 0
 // for one decision per window. The next decision looks at cycles before `look_cycle`. `since` is
 // the first cycle under the placement in force, and `look_0` the first decision after it.
@@ -73,7 +74,7 @@ struct Crossing;  // of meter.cpp
   field(i64, decide_cycles) field(i64, since) field(i64, look_0) field(i64, look)                \
   field(i64, look_cycle) field(i64, look_pending)                                                \
   field(i64, deadline_ns) field(f64, longest_ms) /* larger latencies count as this */            \
-  field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited)                                \
+  field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited) field(i64, chain_due_ns)       \
   field(i64, period_ns) field(i64, released) /* cycles */                                        \
   field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
