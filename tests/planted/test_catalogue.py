@@ -17,14 +17,10 @@ WITHOUT = {
     "docs/reference/faults.md": {
         "What happens when a process, a node or a link fails?",
         "What holds",
-        "What it costs",
-        "By seed, in memory",
-        "Soak",
     },
     "docs/concepts.md": {"Concepts", "Words", "Glossary"},
     "docs/background/statistics.md": {
         "Which statistics does Dwell compute?",
-        "Global sensitivity",
         "References",
     },
 }
