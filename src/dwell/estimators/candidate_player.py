@@ -56,7 +56,7 @@ class PlayedWindows(NamedTuple):
 
     @property
     def violation_rate(self) -> Floats:
-        """V_D."""
+        """Share of the counted cycles that missed."""
         return self.missed / self.counted
 
 

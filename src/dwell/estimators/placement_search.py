@@ -85,7 +85,7 @@ class Ranking:
 
     @property
     def is_tie(self) -> bool:
-        """Whether the two best placements are not told apart."""
+        """Whether the samples do not show which of the two best placements is better."""
         gain, error = self.difference
         return bool(gain < APART * error) or gain == 0.0
 
