@@ -38,7 +38,7 @@ CYCLES, FEWEST = 10_000, 9
 
 @dataclass(frozen=True, slots=True)
 class PricedCell:
-    """A cell of a fleet, with all that its price depends on."""
+    """A cell of a fleet, with everything that determines its price."""
 
     name: str
     #: With its phase.

@@ -223,6 +223,11 @@ class Problem(Displayed):
         return self.window_cycles * self.pipeline.period_ms
 
     @property
+    def due_cycles(self) -> int:
+        """Fewest cycles of a window in which a sink is due."""
+        return self.window_cycles // self.pipeline.due_interval
+
+    @property
     def window_ns(self) -> int:
         """Length of a window, nanoseconds."""
         return self.window_cycles * self.pipeline.period_ns

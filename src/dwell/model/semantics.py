@@ -182,7 +182,7 @@ def _names(parts: CellParts) -> Iterator[Fault]:
 
 
 def bad_name(name: str) -> str:
-    """Return what is wrong with a name, or nothing."""
+    """Return the fault of a name; empty if it has none."""
     if NAME.fullmatch(name) is not None and len(name) <= LONGEST_NAME:
         return ""
     rule = (
