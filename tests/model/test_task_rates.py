@@ -188,11 +188,10 @@ def test_the_guard_needs_a_sink_in_each_cycle() -> None:
     assert "no sink" in message
 
 
-def test_live_cells_refuse_rates() -> None:
+def test_live_cells_refuse_sampled_flows() -> None:
     with pytest.raises(LiveError) as caught:
         wire(made(cell(live={"hosts": {"R": {"address": "10.0.0.1", "port": 7000}}})))
-    for words in ("tasks.camera.every", "flows[2].sampled"):
-        assert words in str(caught.value)
+    assert "flows[2].sampled" in str(caught.value)
 
 
 def test_fleets_refuse_rates() -> None:

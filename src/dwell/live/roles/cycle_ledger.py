@@ -20,7 +20,8 @@ from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wire.messages import ACTUATED, BEHIND, NOT_APPLIED, STALE, Completion, Hop, Stamp
 from dwell.live.wire.wiring import lane_of
-from dwell.model import Execution, Problem
+from dwell.model import Execution, Flow, Problem
+from dwell.model.due_tasks import DueTasks
 from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
@@ -35,6 +36,8 @@ UNKNOWN = -1
 MAX_SHADOWS = 16
 #: Least share of a window in which a hook must have measured an accelerator.
 HOOKED_SHARE = 0.5
+#: Instant of a job or message in a cycle in which it is not due.
+NOT_DUE = -2
 #: Outcomes of jobs that ended before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
 
@@ -60,6 +63,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         First release of the run, on the stamper's clock.
     heard : bool
         Whether a message with its stamp has arrived; if not, only its neighbours are known.
+    idle : bool
+        Whether no sink is due in it.
 
     Attributes
     ----------
@@ -101,6 +106,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     at_ns: int
     origin_ns: int
     heard: bool
+    idle: bool = False
     stamped_ns: int | None = None
     group_ns: int = UNKNOWN
     reports: dict[str, Completion] = {}
@@ -121,11 +127,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     shifts: dict[str, Shift] = {}
 
     @classmethod
-    def of(cls, stamp: Stamp, origin_ns: int) -> LiveCycle:
+    def of(cls, stamp: Stamp, origin_ns: int, *, idle: bool = False) -> LiveCycle:
         """Return the cycle of a stamp."""
         at_ns = stamp.released_ns - origin_ns
         who = stamp.run, stamp.cycle, stamp.term, stamp.placement, stamp.shadow
-        return cls(*who, at_ns, origin_ns, heard=True)
+        return cls(*who, at_ns, origin_ns, heard=True, idle=idle)
 
     @property
     def key(self) -> tuple[int, int]:
@@ -195,14 +201,14 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     @property
     def untold(self) -> bool:
         """Whether it is unknown if the cycle has completed."""
-        return self.deaf and not (self.reports or self.replaced or self.told)
+        return self.deaf and not (self.reports or self.replaced or self.told or self.idle)
 
     def missed(self, deadline_ns: int) -> bool:
         """Whether it was later than D, unfinished at the end of its window, or not applied.
 
         A command that the gate found stale counts as missed, even if its latency is below D.
         """
-        if self.untold:
+        if self.untold or self.idle:
             return False
         if self.came_to(NOT_APPLIED, STALE):
             return True
@@ -211,13 +217,18 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
 
 def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
-    """Return the cycles of a window whose outcome is known; all cycles if none is known."""
-    return [cycle for cycle in cycles if not cycle.untold] or cycles
+    """Return the cycles of a window whose outcome is known; all cycles if none is known.
+
+    Idle cycles are left out.
+    """
+    counted = [cycle for cycle in cycles if not cycle.idle]
+    return [cycle for cycle in counted if not cycle.untold] or counted
 
 
 def violation_rate(cycles: Sequence[LiveCycle], deadline_ns: int) -> float:
-    """Return V_D, the share of cycles that missed their deadline."""
-    return sum(cycle.missed(deadline_ns) for cycle in cycles) / len(cycles)
+    """Return V_D, the share of cycles that missed their deadline; NaN without cycles."""
+    missed = sum(cycle.missed(deadline_ns) for cycle in cycles)
+    return missed / len(cycles) if cycles else math.nan
 
 
 class Ledger:
@@ -225,7 +236,9 @@ class Ledger:
 
     def __init__(self, problem: Problem, offsets: Offsets) -> None:
         pipeline = problem.pipeline
-        self.sinks = frozenset(name for name in pipeline.tasks if not pipeline.outputs(name))
+        self.sinks = frozenset(pipeline.sinks)
+        #: Tasks that run in each cycle.
+        self.due = DueTasks(pipeline)
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
         self._stamper_node = problem.stamper_node
         self._nodes, self._resources = problem.fabric.nodes, problem.fabric.resources
@@ -248,8 +261,8 @@ class Ledger:
     # ------------------------------------------------------------------------ latency
 
     def complete(self, cycle: LiveCycle) -> bool:
-        """Whether every sink has reported a cycle."""
-        return len(cycle.reports) == len(self.sinks)
+        """Whether every due sink has reported a cycle; false for an idle cycle."""
+        return not cycle.idle and self.due.sinks(cycle.number) <= cycle.reports.keys()
 
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
         """Compute latency and parts of a complete cycle.
@@ -555,6 +568,7 @@ class Ledger:
         `shadows` tells whether the result has the shadows' instants.
         """
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
+        self._mark_not_due(known, cycles)
         through = np.full(len(cycles), -1, np.int64)
         for row, cycle in enumerate(cycles):
             if cycle.shadow in self._codes:
@@ -568,7 +582,8 @@ class Ledger:
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._doubt(cycle, report)
                 self._enter(known, row, cycle, report.hops, self._every)
-            if cycle.heard and not (cycle.deaf or cycle.reports or cycle.replaced or cycle.told):
+            reported = cycle.deaf or cycle.reports or cycle.replaced or cycle.told
+            if cycle.heard and not (reported or cycle.idle):
                 self._mark_lost(known, row, cycle)
         for tables in (known, of_shadows):
             tables["work_ns"][tables["end_ns"] > close_ns] = UNKNOWN
@@ -590,6 +605,17 @@ class Ledger:
         columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), len(self._tasks))
         columns["arrived_ns"] = len(self._flows)
         return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
+
+    def _mark_not_due(self, known: Mapping[str, Ints], cycles: Sequence[LiveCycle]) -> None:
+        """Mark the jobs and messages of cycles in which they are not due."""
+        if not self._pipeline.has_rates:
+            return
+        numbers = np.array([cycle.number for cycle in cycles], np.int64)
+        of_tasks = np.array([self.due.rates[name] for name in self._tasks])
+        of_flows = np.array([self._pipeline.message_rate(flow) for flow in self._pipeline.flows])
+        for name, instants in known.items():
+            rates = of_flows if name == "arrived_ns" else of_tasks
+            instants[numbers[:, None] % rates != 0] = NOT_DUE
 
     def _enter(
         self,
@@ -625,11 +651,16 @@ class Ledger:
         nodes = self._candidates[cycle.placement]
         for flow in self._forward:
             column = self._flows[flow.source, flow.target]
-            if nodes[flow.source] != nodes[flow.target] and known["arrived_ns"][row, column] < 0:
+            is_lost = known["arrived_ns"][row, column] == UNKNOWN
+            if nodes[flow.source] != nodes[flow.target] and is_lost and self._loses(flow, cycle):
                 source = self._tasks[flow.source]
                 if known["end_ns"][row, source] < 0:
                     known["end_ns"][row, source] = cycle.at_ns
                 return
+
+    def _loses(self, flow: Flow, cycle: LiveCycle) -> bool:
+        """Whether the loss of a flow's message loses a cycle."""
+        return not flow.sampled and self.due.is_needed(flow.target, cycle.number)
 
     def unreached(self, cycle: LiveCycle, through: str) -> tuple[str, str] | None:
         """Return source and target of the first unconfirmed message between two nodes.
@@ -648,7 +679,10 @@ class Ledger:
         }
         idle = {hop.task for hop in hops if hop.ended_ns == UNKNOWN and nodes[hop.task] == hop.node}
         missing = []
+        of_shadow, number = through != cycle.placement, cycle.number
         for one in self._forward:
+            if not (self.due.sends(one, number) if of_shadow else self._loses(one, cycle)):
+                continue
             if one.source in idle:
                 idle.add(one.target)
             elif nodes[one.source] != nodes[one.target] and (one.source, one.target) not in there:
@@ -667,6 +701,12 @@ class Ledger:
             here, there = (self._candidates[name] for name in pair)
             self._apart[pair] = self._pipeline.diverging(here, there)
         return self._apart[pair]
+
+    def shadow_ends(self, cycle: LiveCycle) -> frozenset[str]:
+        """Return the tasks that report the end of a cycle's shadow; none without a shadow."""
+        if cycle.shadow not in self._codes:
+            return frozenset()
+        return self.due.shadow_ends(self._diverging(cycle), cycle.number)
 
     def shadow_bytes(self, cycles: Iterable[LiveCycle]) -> tuple[int, int]:
         """Return the number of cycles with a shadow, and the bytes that shadows sent over links.

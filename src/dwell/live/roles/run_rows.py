@@ -224,6 +224,8 @@ class RunRows:
         return isinstance(last, int) and last < self.next_row
 
     def _outcome(self, cycle: LiveCycle) -> str:
+        if cycle.idle:
+            return "idle"
         if cycle.came_to(NOT_APPLIED):
             return NOT_APPLIED
         if self._ledger.complete(cycle) or cycle.told:

@@ -112,11 +112,11 @@ class Stamper:
         self._early = any(node != place.node for _, node, _ in self._sources())
         self._ahead: Stamp | None = None
         self._names = tuple(problem.candidates)
-        self._sinks = frozenset(
-            name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
-        )
-        self.intervals = Intervals(place.node, self._sinks)
+        self._due = self.routes.due
+        self.intervals = Intervals(place.node, self._due.sinks)
+        # Tasks that have reported cycles, and shadows, of which others have not.
         self._partial: dict[int, set[str]] = {}
+        self._partial_shadows: dict[int, set[str]] = {}
         self._open = problem.pipeline.open_cycles
         self.shadow_fraction = 0.0
         self.forks: tuple[tuple[str, str], ...] = ()
@@ -217,7 +217,7 @@ class Stamper:
         if not self._unsure or not self._claims.believed(who, run) or run <= self.run:
             return
         self._ahead, self._answered = None, None
-        self._partial.clear()
+        self._forget_reports()
         # Cycles of the previous run never complete: processes downstream know a later run.
         self.guard.restart()
         self.guard.failures.restart()
@@ -229,22 +229,20 @@ class Stamper:
         if stamp.run != self.run:
             return
         if done.outcome == "shadow":
-            if done.sink in self._sinks and stamp.shadow in self._names:
+            ends = self.routes.shadow_ends(stamp)
+            if _reported_by_all(self._partial_shadows, done, ends):
                 self.guard.shadow_arrived(stamp.cycle, now_ns, stamp.shadow)
             return
         # A command that the actuator refused counts: the placement has delivered it.
-        handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
-        if not handed_over or stamp.cycle <= self.guard.newest - self._open:
+        if done.outcome not in HANDED_OVER or stamp.cycle <= self.guard.newest - self._open:
             return
-        sinks = self._partial.setdefault(stamp.cycle, set())
-        if done.sink in sinks:
-            return
-        sinks.add(done.sink)
-        if sinks == self._sinks:
+        if _reported_by_all(self._partial, done, self._due.sinks(stamp.cycle)):
             self._complete(stamp, now_ns)
-        if len(self._partial) > MAX_PARTIAL:
-            for cycle in sorted(self._partial)[: MAX_PARTIAL // 2]:
-                del self._partial[cycle]
+
+    def _forget_reports(self) -> None:
+        """Forget the reports of cycles and shadows that have not completed."""
+        self._partial.clear()
+        self._partial_shadows.clear()
 
     def _complete(self, stamp: Stamp, now_ns: int) -> None:
         """Record a cycle whose commands have reached all sinks."""
@@ -357,7 +355,7 @@ class Stamper:
             self.shadow_fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
         del self.moves[:-1_000]
-        self._partial.clear()
+        self._forget_reports()
         self.guard.adopt(placement, fallback=by_guard)
         self.course.enter(self.run, self.term + 1)
         self._write()
@@ -435,7 +433,7 @@ class Stamper:
     def _gates(self) -> Iterator[str]:
         """Yield the names of the sinks' processes of the current placement."""
         placed = self.place.problem.candidates[self.placement]
-        return (f"sink.{task}@{placed[task]}" for task in self._sinks)
+        return (f"sink.{task}@{placed[task]}" for task in self.place.problem.pipeline.sinks)
 
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""
@@ -447,8 +445,9 @@ class Stamper:
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
-        self.guard.sent(stamp.cycle, released_ns, stamp.placement)
-        if stamp.shadow:
+        if not self._due.is_idle(stamp.cycle):
+            self.guard.sent(stamp.cycle, released_ns, stamp.placement)
+        if self.routes.shadow_ends(stamp):
             self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
         intervals = self.intervals.take_unreported()
@@ -493,3 +492,20 @@ class Stamper:
 
     def _holds(self) -> BeatState:
         return BeatState(self.course.term, self.course.placement)
+
+
+def _reported_by_all(
+    partial: dict[int, set[str]], done: Completion, expected: frozenset[str]
+) -> bool:
+    """Add a report of a cycle; return whether it is the last of the expected reports."""
+    if done.sink not in expected:
+        return False
+    cycle = done.stamp.cycle
+    reported = partial.setdefault(cycle, set())
+    if done.sink in reported:
+        return False
+    reported.add(done.sink)
+    if len(partial) > MAX_PARTIAL:
+        for old in sorted(partial)[: MAX_PARTIAL // 2]:
+            del partial[old]
+    return reported == expected

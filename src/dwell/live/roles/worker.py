@@ -90,7 +90,12 @@ class Worker:
         self._counted: tuple[Counts, int, Counts] = NOT_COUNTED
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
-        self._source = SourceCycles(place, self.offsets, offset_ns) if STAMPER in sources else None
+        rate = self.routes.due.rates[task]
+        self._source = (
+            SourceCycles(place, self.offsets, offset_ns, rate) if STAMPER in sources else None
+        )
+        #: Time from one job to the next.
+        self._interval_ns = rate * place.period_ns
         #: State of the stage, which moves with the task.
         self.transfer = StateTransfer(place, task, stage, self._failed, shadow=shadow)
         self.started = False
@@ -279,7 +284,7 @@ class Worker:
             # The restored state already contains this job.
             self._replace(self._jobs.popleft())
         if not self.active:
-            horizon_ns = now_ns - 2 * self.place.period_ns
+            horizon_ns = now_ns - 2 * self._interval_ns
             while self._jobs and self._jobs[0].arrived_ns < horizon_ns:
                 self._jobs.popleft()
             return None
@@ -413,7 +418,7 @@ class Worker:
 
     def _state(self) -> tuple[bool, str]:
         where = f"{self.task} on {self.place.node}"
-        limit_ns = self.place.hang_ns
+        limit_ns = max(self.place.hang_ns, 10 * self._interval_ns)
         if self.busy_since_ns is not None:
             busy_ns, chore = self._now_ns - self.busy_since_ns, self._chore
             call = f"cycle {self._busy_cycle}: process()" if chore is None else chore.call

@@ -187,7 +187,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
-    _require_one_rate(problem)
+    _require_live_keys(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -333,17 +333,16 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
     return False
 
 
-def _require_one_rate(problem: Problem) -> None:
-    """Raise a LiveError if a task has a rate of its own, a flow is sampled, or a chain is given."""
+def _require_live_keys(problem: Problem) -> None:
+    """Raise a LiveError for each key of the pipeline that a live cell cannot follow."""
     pipeline = problem.pipeline
-    keys = [f"tasks.{name}.every" for name, task in pipeline.tasks.items() if task.every]
-    keys += [f"flows[{i}].sampled" for i, flow in enumerate(pipeline.flows) if flow.sampled]
+    keys = [f"flows[{i}].sampled" for i, flow in enumerate(pipeline.flows) if flow.sampled]
     keys += [f"chains.{name}" for name in pipeline.chains]
     if keys:
         raise LiveError(
             "\n".join(
                 f"{key}: not supported in the live cell {problem.name}; only the simulator has "
-                "several rates and chains: remove it, or use dwell run"
+                "sampled flows and chains: remove it, or use dwell run"
                 for key in keys
             )
         )
