@@ -60,3 +60,40 @@ def rated(**changes: Any) -> Problem:
 def world_of(problem: Problem, **more: Any) -> World:
     """Return a cell in memory whose jobs take 1 ms."""
     return World(problem, exec_ms=dict.fromkeys(problem.pipeline.tasks, 1.0), **more)
+
+
+def sampling(*, waited: bool = True, linked_back: bool = True, **changes: Any) -> Problem:
+    """Return a cell in which a controller samples what a slower detector finds.
+
+    Both can run on two nodes. Without `waited` the controller has no other input; without
+    `linked_back` no link leads from the edge to the robot, and the controller is the sink.
+    """
+    tasks = {
+        "camera": {"every": SLOW, "on": _on("R")},
+        "imu": {"on": _on("R")},
+        "detect": {"on": _on("R", "E")},
+        "control": {"on": _on("R", "E")},
+    }
+    flows: list[dict[str, Any]] = [
+        {"from": "camera", "to": "detect"},
+        {"from": "detect", "to": "control", "bytes": 100, "sampled": True},
+    ]
+    if waited:
+        flows.append({"from": "imu", "to": "control"})
+    else:
+        del tasks["imu"]
+    if linked_back:
+        tasks["act"] = {"on": _on("R")}
+        flows.append({"from": "control", "to": "act"})
+    given = {
+        "tasks": tasks,
+        "flows": flows,
+        "links": [{"from": "R", "to": "E", "both_ways": linked_back, "delay_ms": 0.2}],
+        "candidates": {
+            "LOC": {"detect": "R", "control": "R"},
+            "AWAY": {"detect": "R", "control": "E"},
+            **({"SPLIT": {"detect": "E", "control": "R"}} if linked_back else {}),
+        },
+        "controller": {"on": "E", "initial": "LOC"},
+    }
+    return from_document(document(**(given | changes)))

@@ -85,7 +85,9 @@ def test_a_move_loses_no_run_of_a_slow_task(stateful: bool) -> None:
 
 def test_checkpoints_count_the_runs_of_their_task() -> None:
     live = {"checkpoint_cycles": 4}
-    world = world_of(rated(controller=GUARDED, live=live, state_bytes=100), stages={"fuse": Counting})
+    world = world_of(
+        rated(controller=GUARDED, live=live, state_bytes=100), stages={"fuse": Counting}
+    )
     states: list[int] = []
 
     def hear(sample: Arrival) -> None:
@@ -135,7 +137,9 @@ def test_a_simulated_run_with_idle_cycles_is_decided_on_in_the_same_way_live(
 ) -> None:
     settings = {"min_dwell": 0, "min_improvement": 0.0, "order_lead_cycles": 2, "fallbacks": ()}
     initial = Random(seed).choice(["LOC", "SO", "HYB"])
-    cell = canonical(20, decide_cycles=every, estimator="tests.live.replayed:Dated", initial=initial, **settings)
+    cell = canonical(
+        20, decide_cycles=every, estimator="tests.live.replayed:Dated", initial=initial, **settings
+    )
     played = simulate(every_other(cell), "robot-cpu-stress", windows=15, seed=seed)
     _, controller, _, evidence, rows = replay(played, SYNCHRONOUS, messages_of(played, Clocks()))
     live, simulated = recorded(tmp_path, controller, rows), played.run

@@ -188,10 +188,11 @@ def test_the_guard_needs_a_sink_in_each_cycle() -> None:
     assert "no sink" in message
 
 
-def test_live_cells_refuse_sampled_flows() -> None:
-    with pytest.raises(LiveError) as caught:
-        wire(made(cell(live={"hosts": {"R": {"address": "10.0.0.1", "port": 7000}}})))
-    assert "flows[2].sampled" in str(caught.value)
+def test_live_cells_refuse_chains() -> None:
+    hosts = {"R": {"address": "10.0.0.1", "port": 7000}}
+    chains = {"see-act": {"from": "camera", "to": "control"}}
+    with pytest.raises(LiveError, match="chains.see-act: not supported"):
+        wire(made(cell(live={"hosts": hosts}, chains=chains)))
 
 
 def test_fleets_refuse_rates() -> None:

@@ -18,7 +18,16 @@ import numpy as np
 from dwell.control import Evidence, Instants
 from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.wire.messages import ACTUATED, BEHIND, NOT_APPLIED, STALE, Completion, Hop, Stamp
+from dwell.live.wire.messages import (
+    ACTUATED,
+    BEHIND,
+    NOT_APPLIED,
+    SAMPLED,
+    STALE,
+    Completion,
+    Hop,
+    Stamp,
+)
 from dwell.live.wire.wiring import lane_of
 from dwell.model import Execution, Flow, Problem
 from dwell.model.due_tasks import DueTasks
@@ -76,6 +85,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         Completions by sink.
     heard_ns : dict of str to int
         Arrivals of the completions on the controller's clock, if known, by sink.
+    samples : dict of (str, str) to Completion
+        Reports of messages that have arrived at a task that samples them, by source and target.
     replaced : dict of str to Completion
         Reports of jobs that a newer cycle replaced, by task.
     latency_ns : int
@@ -112,6 +123,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     reports: dict[str, Completion] = {}
     heard_ns: dict[str, int] = {}
     shadows: tuple[Completion, ...] = ()
+    samples: dict[tuple[str, str], Completion] = {}
     replaced: dict[str, Completion] = {}
     latency_ns: int = NEVER_NS
     parts_ns: tuple[int, int, int] | None = None
@@ -143,6 +155,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         """Reported jobs of this cycle, not of its shadow; several sinks may report one job."""
         for done in (*self.replaced.values(), *self.reports.values()):
             yield from done.hops
+        for done in self.samples.values():
+            yield from done.hops[:-1]
 
     @property
     def segment(self) -> tuple[int, int, str]:
@@ -163,6 +177,9 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
             if new:
                 self.shadows += (completion,)
             return new
+        if completion.outcome == SAMPLED:
+            flow = next(iter(_arrived(completion)), "")
+            return self.samples.setdefault((flow, completion.sink), completion) is completion
         if completion.outcome == REPLACED:
             return self.replaced.setdefault(completion.sink, completion) is completion
         if completion.sink in self.reports:
@@ -246,6 +263,7 @@ class Ledger:
         self.loads = {node: NodeLoad() for node in self._nodes}
         self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
         self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
+        self._sampled = {(f.source, f.target) for f in pipeline.flows if f.sampled}
         self._codes = {name: code for code, name in enumerate(problem.candidates)}
         self._every = frozenset(pipeline.tasks)
         order = pipeline.topological()
@@ -255,7 +273,7 @@ class Ledger:
 
     def tells(self, completion: Completion) -> bool:
         """Whether a completion's task can have its outcome: before a sink any task, else a sink."""
-        early = completion.outcome in {SHADOW, REPLACED}
+        early = completion.outcome in {SHADOW, REPLACED, SAMPLED}
         return completion.sink in (self._every if early else self.sinks)
 
     # ------------------------------------------------------------------------ latency
@@ -263,6 +281,10 @@ class Ledger:
     def complete(self, cycle: LiveCycle) -> bool:
         """Whether every due sink has reported a cycle; false for an idle cycle."""
         return not cycle.idle and self.due.sinks(cycle.number) <= cycle.reports.keys()
+
+    def is_replaced(self, cycle: LiveCycle) -> bool:
+        """Whether a later cycle has replaced a job that a due sink waits for."""
+        return any(self.due.is_needed(task, cycle.number) for task in cycle.replaced)
 
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
         """Compute latency and parts of a complete cycle.
@@ -501,7 +523,8 @@ class Ledger:
         jobs: Jobs = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
         hops = [(hop, False) for hop in cycle.hops]
-        hops += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
+        ended = [hop for done in cycle.shadows for hop in self._ran(done)]
+        hops += [(hop, hop.task in apart) for hop in ended]
         for hop, shadow in hops:
             if hop.task not in self._tasks or (shadow and hop.task in self.sinks):
                 continue
@@ -576,13 +599,20 @@ class Ledger:
                 apart = self._diverging(cycle)
                 for report in cycle.shadows:
                     self._doubt(cycle, report)
-                    self._enter(of_shadows, row, cycle, report.hops, apart)
+                    ran = self._ran(report)
+                    self._enter(of_shadows, row, cycle, ran, apart)
                     # Jobs that the shadow shares with the cycle, whose own report may be missing.
-                    self._enter(known, row, cycle, report.hops, self._every - apart)
+                    self._enter(known, row, cycle, ran, self._every - apart)
+                    if len(ran) < len(report.hops):
+                        self._enter_arrivals(of_shadows, row, cycle, report.hops[-1])
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._doubt(cycle, report)
                 self._enter(known, row, cycle, report.hops, self._every)
-            reported = cycle.deaf or cycle.reports or cycle.replaced or cycle.told
+            for report in cycle.samples.values():
+                self._doubt(cycle, report)
+                self._enter(known, row, cycle, report.hops[:-1], self._every)
+                self._enter_arrivals(known, row, cycle, report.hops[-1])
+            reported = cycle.deaf or cycle.reports or self.is_replaced(cycle) or cycle.told
             if cycle.heard and not (reported or cycle.idle):
                 self._mark_lost(known, row, cycle)
         for tables in (known, of_shadows):
@@ -641,10 +671,22 @@ class Ledger:
             # A shadow's last messages arrive at a sink whose job never runs.
             if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
                 known["ready_ns"][row, column] = max(ready_ns, 0)
-            for source, arrived_ns in hop.inputs:
-                flow = self._flows.get((source, hop.task))
-                if flow is not None:
-                    known["arrived_ns"][row, flow] = max(arrived_ns + shift_ns, 0)
+            self._enter_arrivals(known, row, cycle, hop)
+
+    def _enter_arrivals(
+        self, known: Mapping[str, Ints], row: int, cycle: LiveCycle, hop: Hop
+    ) -> None:
+        """Enter the instants of the messages that reached a job."""
+        for source, arrived_ns in hop.inputs:
+            flow = self._flows.get((source, hop.task))
+            at_ns = self._since_origin(cycle, hop.node, arrived_ns)
+            if flow is not None and cycle.shifts[hop.node].bound_ns < UNBOUNDED_NS:
+                known["arrived_ns"][row, flow] = max(at_ns, 0)
+
+    def _ran(self, done: Completion) -> tuple[Hop, ...]:
+        """Return the jobs of a shadow, without the arrival of its output at a sampling task."""
+        sampled = any((source, done.sink) in self._sampled for source in _arrived(done))
+        return done.hops[:-1] if sampled else done.hops
 
     def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
         """Mark the first unconfirmed message between two nodes as lost."""
@@ -735,3 +777,10 @@ def _between(before_ns: int, after_ns: int) -> int:
     """Difference of two counts; `UNKNOWN` if one is unknown or the counter has restarted."""
     known = UNKNOWN not in (before_ns, after_ns) and after_ns >= before_ns
     return after_ns - before_ns if known else UNKNOWN
+
+
+def _arrived(done: Completion) -> Iterator[str]:
+    """Yield the sources of the messages at which a cycle or shadow has ended."""
+    last = done.hops[-1] if done.hops else None
+    if last is not None and last.task == done.sink:
+        yield from (source for source, _ in last.inputs)

@@ -171,7 +171,11 @@ def _symptoms(
         limit_ms = max(patience_ms + interval_ms, problem.max_age_ms(role.task))
         if _heard(status, role) and age_ms > limit_ms:
             # The last outcome shows that the gate rejects the commands.
-            late = [*slow, _stale(problem.max_age_ms(role.task), sink["stale_ms"])] if sink["outcome"] == STALE else []
+            late = (
+                [*slow, _stale(problem.max_age_ms(role.task), sink["stale_ms"])]
+                if sink["outcome"] == STALE
+                else []
+            )
             why = [*late, *_notes(status, [role.who])]
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent = status["recent"]

@@ -158,7 +158,7 @@ class LiveWindows:
         cycle = self._note(completion.stamp, at_ns)
         if cycle is None or not cycle.take(completion, at_ns):
             return
-        if at_ns is not None and completion.sink in cycle.heard_ns:
+        if at_ns is not None and cycle.reports.get(completion.sink) is completion:
             self._symptoms.completed(completion, at_ns)
         if self._ledger.complete(cycle):
             self.record.newest_done = max(self.record.newest_done, cycle.key)

@@ -230,7 +230,7 @@ class RunRows:
             return NOT_APPLIED
         if self._ledger.complete(cycle) or cycle.told:
             return "done"
-        if cycle.replaced:
+        if self._ledger.is_replaced(cycle):
             return "replaced"
         return "dropped" if cycle.key < self.newest_done else "in_flight"
 
