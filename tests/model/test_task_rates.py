@@ -179,13 +179,12 @@ def test_frames_release_each_cycle() -> None:
     assert "every" in message
 
 
-def test_the_guard_needs_a_sink_in_each_cycle() -> None:
+def test_fallbacks_fit_a_cell_with_idle_cycles() -> None:
     document = cell(controller={"fallbacks": ["LOC"]})
-    assert made(document).controller.fallbacks == ("LOC",)
     document["flows"][2]["sampled"] = False
-    path, message = fault_of(document, control={"every": 10})
-    assert path == "controller.fallbacks"
-    assert "no sink" in message
+    problem = made(document, control={"every": 10})
+    assert problem.pipeline.has_idle_cycles
+    assert problem.controller.fallbacks == ("LOC",)
 
 
 def test_live_cells_refuse_chains() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dwell.model import Problem
@@ -18,18 +19,6 @@ class Actuation:
     age_ns: int
 
 
-def descent(problem: Problem, result: Result, start: str, task: str, cycle: int) -> set[int]:
-    """Return the cycles of `start` from which a job descends."""
-    if task == start:
-        return {cycle}
-    rates, found = Rates(problem.pipeline), set[int]()
-    for flow in rates.waited_inputs(task):
-        found |= descent(problem, result, start, flow.source, cycle)
-    for source, taken in result.jobs[cycle, task].taken.items():
-        found |= descent(problem, result, start, source, taken)
-    return found
-
-
 def actuations(
     problem: Problem, result: Result, release_ns: list[int], start: str, end: str
 ) -> list[Actuation]:
@@ -39,9 +28,14 @@ def actuations(
         for (cycle, task), job in result.jobs.items()
         if task == end and job.outcome == "done" and job.end_ns is not None
     )
+    rates = Rates(problem.pipeline)
     found: list[Actuation] = []
     origin = 0
+
+    def taken(cycle: int, task: str) -> Mapping[str, int]:
+        return result.jobs[cycle, task].taken
+
     for at_ns, cycle in done:
-        origin = min(descent(problem, result, start, end, cycle), default=origin)
+        origin = min(rates.descent(taken, start, end, cycle), default=origin)
         found.append(Actuation(cycle, at_ns, at_ns - release_ns[origin]))
     return found

@@ -175,9 +175,10 @@ def _most_threads(node: Node) -> int:
 
 
 def with_windows_up_to(cycles: int, problem: Problem) -> Problem:
-    """Return a problem whose windows have at most some cycles."""
-    if problem.window_cycles <= cycles:
+    """Return a problem whose windows have at most some cycles, or one run of each sink."""
+    most = max(cycles, problem.pipeline.sink_cycles)
+    if problem.window_cycles <= most:
         return problem
-    every = min(problem.decide_cycles, cycles)
+    every = min(problem.decide_cycles, most)
     controller = replace(problem.controller, decide_cycles=every)
-    return replace(problem, window_cycles=cycles, controller=controller)
+    return replace(problem, window_cycles=most, controller=controller)

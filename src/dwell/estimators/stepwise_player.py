@@ -72,7 +72,8 @@ class StepwisePlayer:
         self.problem, self._seed, self._shadow_fraction = problem, seed, shadow_fraction
         self.declared = declared_of(problem, seed, shadow_fraction)
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
-        self._window = min(problem.window_cycles, LONGEST_WINDOW)
+        played = with_windows_up_to(LONGEST_WINDOW, problem)
+        self._window = played.window_cycles
         self._names, self._resources = tuple(problem.candidates), tuple(problem.fabric.resources)
         self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
         #: Standard deviations of a step's L95 (ms) and V_D, as declared.
@@ -85,7 +86,7 @@ class StepwisePlayer:
         }
         self.cycles = 0
         self._player = CandidatePlayer(
-            [(with_windows_up_to(LONGEST_WINDOW, problem), self.declared.realisation)],
+            [(played, self.declared.realisation)],
             shadows=self.declared.shadows,
             measures=True,
         )

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, Bound, counted, require
+from dwell.model.chain import ChainPatience
 from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
@@ -120,7 +121,7 @@ class Problem(Displayed):
         )
 
     def _require_due_sinks(self) -> None:
-        """Refuse windows in which a sink never runs, and features that do not support rates."""
+        """Refuse windows in which a sink never runs, and camera frames in cells with rates."""
         rates = self.pipeline.rates
         slowest = max(self.pipeline.sinks, key=lambda name: rates[name])
         bound = f"at least {rates[slowest]}, so that {slowest} runs in each window"
@@ -129,10 +130,6 @@ class Problem(Displayed):
         framed = self.live.release == "frames" and max(rates.values()) > 1
         bound = "timer in a cell with `every`, because each frame releases a cycle"
         require(not framed, "live.release", self.live.release, bound)
-        names = list(self.controller.fallbacks)
-        guarded = bool(names) and self.pipeline.has_idle_cycles
-        bound = "empty, because the guard does not support cycles in which no sink runs"
-        require(not guarded, "controller.fallbacks", names, bound)
 
     def _unplaced(self) -> list[Fault]:
         """Return faults of placements without an anchored task, which only cell files may omit."""
@@ -219,6 +216,11 @@ class Problem(Displayed):
     def window_ms(self) -> float:
         """Length of a window: W P."""
         return self.window_cycles * self.pipeline.period_ms
+
+    @property
+    def due_cycles(self) -> int:
+        """Fewest cycles of a window in which a sink is due."""
+        return self.window_cycles // self.pipeline.due_interval
 
     @property
     def window_ns(self) -> int:
@@ -309,6 +311,27 @@ class Problem(Displayed):
         """Longest wait of the guard for a cycle after its release: max(D, P) + (g - 1) P."""
         pipeline, more = self.pipeline, self.controller.guard_cycles - 1
         return max(pipeline.deadline_ns, pipeline.period_ns) + more * pipeline.period_ns
+
+    @property
+    def chain_patiences(self) -> dict[str, ChainPatience]:
+        """Age of the newest origin at which the guard fires, of each chain with a `max_age_ms`.
+
+        It is max_age_ms + (g - 1) n P, where n is the interval between two origins that may differ.
+        """
+        pipeline, g = self.pipeline, self.controller.guard_cycles
+        rates, found = pipeline.rates, dict[str, ChainPatience]()
+        for name, chain in pipeline.chains.items():
+            if math.isfinite(chain.max_age_ms):
+                interval_ns = pipeline.chain_cycles(chain) * pipeline.period_ns
+                patience_ns = round(chain.max_age_ms * 1e6) + (g - 1) * interval_ns
+                found[name] = ChainPatience(patience_ns, rates[chain.source])
+        return found
+
+    @property
+    def longest_patience_ns(self) -> int:
+        """Longest wait of the guard, for a cycle or for a chain with a `max_age_ms`."""
+        chains = self.chain_patiences.values()
+        return max([self.guard_patience_ns, *(chain.patience_ns for chain in chains)])
 
     @property
     def stamper_node(self) -> str:

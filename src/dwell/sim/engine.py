@@ -212,7 +212,7 @@ def play_cells(
     whole = lay_out(
         [(cell.problem, cell.realisation) for cell in cells],
         shared=shared,
-        log_jobs=jobs or any(cell.problem.pipeline.chains for cell in cells),
+        log_jobs=jobs,
         log_windows=any(cell.controller.learns for cell in cells),
         decides=True,
         shadows=[

@@ -16,7 +16,7 @@ from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
-from dwell.model import REASONS, Chain, Problem
+from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
@@ -266,8 +266,8 @@ def _final_l95_ms(played: PlayedRealisation) -> Floats:
 def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
     """Return the L95 of each chain's data age, and the share over its bound."""
     columns: dict[str, Callable[[], NDArray[np.generic]]] = {}
-    for name, chain in played.problem.pipeline.chains.items():
-        ages_ns = cache(partial(_ages_ns, played, chain))
+    for number, (name, chain) in enumerate(played.problem.pipeline.chains.items()):
+        ages_ns = cache(partial(_ages_ns, played, number))
         columns[f"age_l95_{name}"] = partial(_on_ages, ages_ns, age_l95_ms)
         over = partial(age_missed, max_age_ms=chain.max_age_ms)
         columns[f"age_missed_{name}"] = partial(_on_ages, ages_ns, over)
@@ -278,10 +278,9 @@ def _on_ages(ages_ns: Callable[[], Ints], metric: Callable[[Ints], Floats]) -> F
     return metric(ages_ns())
 
 
-def _ages_ns(played: PlayedRealisation, chain: Chain) -> Ints:
-    """Return a chain's data ages by window."""
-    pipeline, realisation = played.problem.pipeline, played.realisation
-    return played.by_window(chain_ages_ns(pipeline, chain, realisation, played.arrays))
+def _ages_ns(played: PlayedRealisation, number: int) -> Ints:
+    """Return the data ages of a chain by window."""
+    return played.by_window(chain_ages_ns(played.realisation, played.arrays, number))
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
