@@ -199,6 +199,49 @@ def test_a_probe_is_complete_when_its_sampled_output_has_arrived(arrives: bool) 
     assert world.stamper.placement == ("SPLIT" if arrives else "LOC")
 
 
+CHAINS = {"see-act": {"from": "camera", "to": "act", "max_age_ms": 50}}
+
+
+def test_recorded_ages_are_those_of_the_jobs(tmp_path: Path) -> None:
+    world, log = logged(sampling(chains=CHAINS), policy=Staying())
+    done = hear(world, channels.DONE)
+    world.run(400)
+    world.order("AWAY")
+    world.run(600)
+    sampled = {inputs["imu"].cycle: inputs.get("detect") for inputs in log.inputs}
+    age_ms: dict[int, float] = {}
+    first = origin = 0
+    for completion in (decode(sample.payload, RatedCompletion) for sample in done):
+        stamp = completion.stamp
+        first = first or stamp.released_ns - stamp.cycle * P_MS * MS
+        value = sampled[stamp.cycle]
+        origin = origin if value is None else value.cycle
+        age_ms[stamp.cycle] = (completion.done_ns - first) / MS - origin * P_MS
+    numbers = [number for (number,) in columns(world, "cycles", "number")]
+    windows = columns(world, "windows", "first_cycle", "age_l95_see-act", "age_missed_see-act")
+    assert len(windows) >= 3
+    for row, l95_ms, missed in windows:
+        ages = [age_ms[number] for number in numbers[row : row + 20]]
+        assert l95_ms == pytest.approx(sorted(ages)[18])
+        assert missed == sum(age > 50 for age in ages) / 20
+    assert any(missed for _, _, missed in windows)
+
+
+def test_the_guard_leaves_a_placement_whose_detector_is_dead() -> None:
+    controller = {"on": "E", "initial": "SPLIT", "fallbacks": ["LOC"]}
+    world, log = logged(sampling(chains=CHAINS, controller=controller))
+    world.run(600)
+    assert world.stamper.moves == []
+    world.kill("detect@E")
+    world.run(600)
+    assert world.stamper.placement == "LOC"
+    # Commands continue while the detector is dead, and have new pictures behind them later.
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}
+    newest = log.samples[-1]
+    assert newest is not None
+    assert newest >= world.stamper.cycle - 2 * SLOW
+
+
 @pytest.fixture
 def seals(tmp_path: Path) -> dict[str, Seals]:
     authority = Authority.create(tmp_path, "cell")

@@ -159,6 +159,13 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
             yield from done.hops[:-1]
 
     @property
+    def all_reports(self) -> Iterator[Completion]:
+        """Reports with jobs of this cycle, not of its shadow."""
+        yield from self.reports.values()
+        yield from self.replaced.values()
+        yield from self.samples.values()
+
+    @property
     def segment(self) -> tuple[int, int, str]:
         """Run, term and placement; a migration changes them."""
         return self.run, self.term, self.placement
@@ -329,6 +336,11 @@ class Ledger:
             found = self._offsets.to_reference(node, instant_ns)
             shift = cycle.shifts[node] = Shift(found.instant_ns - instant_ns, found.bound_ns)
         return instant_ns + shift.by_ns - cycle.origin_ns
+
+    def instant_ns(self, cycle: LiveCycle, node: str, instant_ns: int) -> int | None:
+        """Convert an instant as `_since_origin`; None if the clocks have not been compared."""
+        at_ns = self._since_origin(cycle, node, instant_ns)
+        return at_ns if cycle.shifts[node].bound_ns < UNBOUNDED_NS else None
 
     def _doubt(self, cycle: LiveCycle, done: Completion) -> None:
         """Mark the clocks as not compared if a cycle's instants are impossible with them.

@@ -8,7 +8,7 @@ from dwell.errors import LiveError
 from dwell.live.roles.joins import Inputs
 from dwell.live.roles.role import RolePlace
 from dwell.live.wire import channels
-from dwell.live.wire.messages import Header, Origin, RatedHop, Stamp, encode
+from dwell.live.wire.messages import Header, Stamp, encode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import lane_of
 
@@ -105,20 +105,3 @@ class SampledInputs:
         key = self._place.keys.of(channels.VALUE, self._task, node, self._place.node)
         lane = lane_of(self._bytes[source])
         self._place.transport.put(key, payload, encode(header), lane=lane)
-
-
-def origins_of(header: Header) -> tuple[Origin, ...]:
-    """Return the cycles from which a message descends; none in a cell without origins."""
-    sender = header.hops[-1] if header.hops else None
-    return sender.origins if isinstance(sender, RatedHop) else ()
-
-
-def oldest_origins(headers: Iterable[Header]) -> dict[str, Origin]:
-    """Return the oldest cycle from which messages descend, by task."""
-    oldest: dict[str, Origin] = {}
-    for header in headers:
-        for one in origins_of(header):
-            known = oldest.setdefault(one.task, one)
-            if one.released_ns < known.released_ns:
-                oldest[one.task] = one
-    return oldest

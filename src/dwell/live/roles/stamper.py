@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,6 +13,7 @@ from dwell.control import CellGuard, shadow_stamps
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
 from dwell.live.roles.latencies import Intervals
+from dwell.live.roles.origins import last_job, origin_of
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.wire import channels
 from dwell.live.wire.continuity import CLAIMS, RESERVED, RunClaims, SetbackDetector
@@ -130,6 +132,8 @@ class Stamper:
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
+        # Placement before the first of these moves.
+        self._first = entry.placement
 
     @property
     def run(self) -> int:
@@ -233,11 +237,28 @@ class Stamper:
             if _reported_by_all(self._partial_shadows, done, ends):
                 self.guard.shadow_arrived(stamp.cycle, now_ns, stamp.shadow)
             return
+        self._acted(done)
         # A command that the actuator refused counts: the placement has delivered it.
         if done.outcome not in HANDED_OVER or stamp.cycle <= self.guard.newest - self._open:
             return
         if _reported_by_all(self._partial, done, self._due.sinks(stamp.cycle)):
             self._complete(stamp, now_ns)
+
+    def _acted(self, done: Completion) -> None:
+        """Report the actuations of guarded chains, with their origins, to the guard."""
+        for name in self.guard.chains:
+            chain = self.place.problem.pipeline.chains[name]
+            is_sink = chain.target in self.place.problem.pipeline.sinks
+            if is_sink and (done.sink != chain.target or done.outcome not in HANDED_OVER):
+                continue
+            origin = origin_of(last_job(done, chain.target), chain.source)
+            if origin is not None:
+                self.guard.acted(name, origin.cycle, self._placed(origin.cycle))
+
+    def _placed(self, cycle: int) -> str:
+        """Return the placement of a stamped cycle."""
+        place = bisect.bisect(self.moves, cycle, key=lambda move: move[0])
+        return self.moves[place - 1][1] if place else self._first
 
     def _forget_reports(self) -> None:
         """Forget the reports of cycles and shadows that have not completed."""
@@ -354,6 +375,8 @@ class Stamper:
             # The next order of the controller sets the shadow fraction of the fallback.
             self.shadow_fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
+        for move in self.moves[:-1_000]:
+            self._first = move[1]
         del self.moves[:-1_000]
         self._forget_reports()
         self.guard.adopt(placement, fallback=by_guard)
@@ -445,8 +468,7 @@ class Stamper:
         early, self._ahead = self._ahead, None
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
-        if not self._due.is_idle(stamp.cycle):
-            self.guard.sent(stamp.cycle, released_ns, stamp.placement)
+        self.guard.sent(stamp.cycle, released_ns, stamp.placement)
         if self.routes.shadow_ends(stamp):
             self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)

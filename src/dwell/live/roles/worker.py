@@ -11,8 +11,9 @@ from msgspec.structs import asdict
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN, Counts
 from dwell.live.roles.joins import MAX_JOINS, Job, Joins
+from dwell.live.roles.origins import oldest_origins, origins_of
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
-from dwell.live.roles.sampled_inputs import SampledInputs, oldest_origins, origins_of
+from dwell.live.roles.sampled_inputs import SampledInputs
 from dwell.live.roles.source_cycles import SourceCycles
 from dwell.live.roles.stage_counts import DROPPED, REPLACED, TAKEN, StageBook
 from dwell.live.roles.state_transfer import Chore, StateTransfer, too_long

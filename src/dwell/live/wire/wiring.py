@@ -185,9 +185,8 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     """Compute the ports and connections of a cell.
 
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
-    missing hosts, missing ports and conflicts, or the keys that live cells do not support.
+    missing hosts, missing ports and conflicts.
     """
-    _require_live_keys(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -333,18 +332,6 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             samples = any(flow.sampled for flow in problem.pipeline.inputs(other.task))
             return stops or (other.kind == "worker" and (samples or not task.anchored))
     return False
-
-
-def _require_live_keys(problem: Problem) -> None:
-    """Raise a LiveError for each key of the pipeline that a live cell cannot follow."""
-    if problem.pipeline.chains:
-        raise LiveError(
-            "\n".join(
-                f"chains.{name}: not supported in the live cell {problem.name}; only the simulator "
-                "has chains: remove it, or use dwell run"
-                for name in problem.pipeline.chains
-            )
-        )
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
