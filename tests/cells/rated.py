@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from random import Random
 from typing import Any
 
 from dwell.cellfile.cell import from_document
-from dwell.model import Flow, Problem
+from dwell.model import Chain, Flow, Problem
+from dwell.model.chain import behind
 from tests.cells.once import with_windows
 
 #: Rates of sources, of which several are multiples of another.
@@ -16,18 +18,8 @@ RATES = 1, 1, 2, 3, 4, 6
 SAMPLED = 0.35
 
 
-def with_rates(problem: Problem, rng: Random, *, idle: bool = True) -> Problem:
-    """Let sources run in every n-th cycle, and sample some flows; windows have all sinks.
-
-    Without `idle` a sink runs in every cycle.
-    """
-    made = _with_rates(problem, rng)
-    while made.pipeline.has_idle_cycles and not idle:
-        made = _with_rates(problem, rng)
-    return made
-
-
-def _with_rates(problem: Problem, rng: Random) -> Problem:
+def with_rates(problem: Problem, rng: Random) -> Problem:
+    """Let sources run in every n-th cycle, and sample some flows; windows have all sinks."""
     pipeline = problem.pipeline
     flows = [replace(flow, sampled=rng.random() < SAMPLED) for flow in pipeline.flows]
     rates: dict[str, int] = {}
@@ -113,3 +105,22 @@ def idle_cell() -> Problem:
         for on in cell["tasks"][name]["on"].values():
             on["exec_ms"] = drawn(1)
     return from_document(cell)
+
+
+def with_chains(problem: Problem, rng: Random) -> Problem:
+    """Let one cell in two have chains between connected tasks, most with a bound on their age."""
+    pipeline = problem.pipeline
+    pairs = [
+        (source, target)
+        for source in pipeline.tasks
+        for target in sorted(behind(source, pipeline.flows))
+    ]
+    if not pairs or rng.random() < 0.5:
+        return problem
+    chains = {}
+    for number in range(rng.choice([1, 1, 2])):
+        source, target = rng.choice(pairs)
+        age_ms = round(pipeline.period_ms * rng.uniform(0.5, 12), 1)
+        bound_ms = rng.choice([age_ms, age_ms, age_ms, math.inf])
+        chains[f"chain{number}"] = Chain(source, target, bound_ms)
+    return replace(problem, pipeline=replace(pipeline, chains=chains))

@@ -168,7 +168,9 @@ class Scaling(Learning):
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics (see `Estimator`)."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
-        if self._active is not None and len(self._jobs):
+        # No path of a cycle bounds the data age of a chain.
+        has_path = self.problem.objective.latency is None
+        if self._active is not None and len(self._jobs) and has_path:
             for name, placement in self.problem.candidates.items():
                 estimates[name] = self._at_least(estimates[name], placement, self._active)
         return estimates

@@ -36,7 +36,7 @@ class FleetEntry:
 
     cell: Problem
     count: int = key("How many cells of it there are.", COUNT, default=1)
-    scenario: str = key("What befalls them.", default="baseline")
+    scenario: str = key("Scenario of these cells.", default="baseline")
     policy: str | None = key("Their policy.", default=None, usual="the fleet's, or the cell's")
     estimator: str | None = key(
         "Their estimator.", default=None, usual="the fleet's, or the cell's"
