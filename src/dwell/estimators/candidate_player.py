@@ -45,6 +45,11 @@ class PlayedWindows(NamedTuple):
         return self.seen["uncut_ms"]
 
     @property
+    def age_ms(self) -> Floats:
+        """Mean age of the newest command; 0 unless J weighs it."""
+        return self.seen["age_ms"]
+
+    @property
     def missed(self) -> Ints:
         """Number of cycles that missed the deadline."""
         return self.seen["missed"]
@@ -56,7 +61,7 @@ class PlayedWindows(NamedTuple):
 
     @property
     def violation_rate(self) -> Floats:
-        """V_D."""
+        """Share of the counted cycles that missed."""
         return self.missed / self.counted
 
 

@@ -185,8 +185,9 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     """Compute the ports and connections of a cell.
 
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
-    missing hosts, missing ports and conflicts.
+    missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
+    _require_latencies(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -332,6 +333,20 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             samples = any(flow.sampled for flow in problem.pipeline.inputs(other.task))
             return stops or (other.kind == "worker" and (samples or not task.anchored))
     return False
+
+
+def _require_latencies(problem: Problem) -> None:
+    """Raise a LiveError if J needs ages, which live windows do not have."""
+    objective = problem.objective
+    keys = {"latency": objective.latency is not None, "weights.age": objective.weighs_age}
+    lines = [
+        f"objective.{key}: not supported in the live cell {problem.name}; only the simulator "
+        "measures ages: remove it, or use dwell run"
+        for key, there in keys.items()
+        if there
+    ]
+    if lines:
+        raise LiveError("\n".join(lines))
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
