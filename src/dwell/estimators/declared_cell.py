@@ -10,13 +10,12 @@ import numpy as np
 
 from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import Meter, Part, parts_of
+from dwell.estimators.measured import Meter, Part, parts_of, patience_of
 from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, most_windows
 from dwell.estimators.remembered import Remembered
 from dwell.estimators.sent_shadows import SentShadows
 from dwell.estimators.slow_processes import slow_processes
-from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import LoggedCycles
 from dwell.kernels.arrays import CellArrays, flow_rows
 from dwell.kernels.random_draws import Drawing
@@ -92,13 +91,13 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
         problem, seed, min(max(windows, math.ceil(least / problem.window_cycles)), most)
     )
     player, meter = CandidatePlayer([(problem, real)], log_jobs=True), Meter(problem)
-    patience_ms = max(patience_ns(problem) / 1e6, problem.pipeline.deadline_ms)
     references: dict[Part, Reference] = {}
     for name, placement in problem.candidates.items():
         missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
         if missing:
             demands = meter.demands(_evidence_of(player, name))
-            for part in missing:
+            for part, patience_ns in zip(missing, patience_of(problem, missing), strict=True):
+                patience_ms = max(patience_ns / 1e6, problem.pipeline.deadline_ms)
                 values = demands.get(part, np.empty(0)).copy()
                 block = min(problem.window_cycles, STEP)
                 kept = windows * problem.window_cycles

@@ -24,7 +24,7 @@ from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
-from dwell.estimators.spans import patience_ns
+from dwell.estimators.spans import task_patience_ns
 from dwell.estimators.stepwise_player import StepwisePlayer
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
@@ -68,7 +68,7 @@ class Online(CellEstimator):
         self.revision = 0
         self._grown = self._until = 1
         self._plays = False
-        self._patience_ns = patience_ns(problem)
+        self._patience_ns = task_patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
         #: Price and work of each candidate as declared, cached at the first estimate.
         self._declared: dict[str, tuple[QoS, list[tuple[str, float]]]] = {}
@@ -266,7 +266,7 @@ class Online(CellEstimator):
     def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
         """Yield idle nodes that have lost at least two jobs since their last completed job."""
         limit_ns = evidence.close_ns - self._patience_ns
-        if not evidence.rows.unknown(limit_ns)[0]:
+        if not evidence.rows.unknown(int(limit_ns.max()))[0]:
             return
         cycles, placements = evidence.cycles, tuple(self.problem.candidates.values())
         lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)

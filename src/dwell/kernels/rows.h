@@ -292,6 +292,7 @@ struct Crossing;  // of meter.cpp
 #define DWELL_FOUND(field)                                                                       \
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
+  field(const i64*, more_ns) /* patience beyond the limit, null for none */                      \
   field(Crossing*, crossings) field(i64, n_crossings)
 
 // The values of a part from a single window: their number, and the sums of their places.
