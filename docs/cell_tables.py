@@ -41,6 +41,7 @@ SHAPES = {
     "weights": cell_form.WEIGHTS,
     "targets": cell_form.TARGETS,
     "caps": cell_form.CAPS,
+    "misses": cell_form.MISSES,
     "the controller": cell_form.CONTROLLER,
     "the servo": cell_form.SERVO,
     "its target": cell_form.TARGET,

@@ -45,6 +45,11 @@ class PlayedWindows(NamedTuple):
         return self.seen["uncut_ms"]
 
     @property
+    def age_ms(self) -> Floats:
+        """Mean age of the newest command; 0 unless J weighs it."""
+        return self.seen["age_ms"]
+
+    @property
     def missed(self) -> Ints:
         """Number of cycles that missed the deadline."""
         return self.seen["missed"]

@@ -163,7 +163,7 @@ class Scaling(Learning):
         """Estimate every candidate's metrics (see `Estimator`)."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
         # With several rates the parts of one cycle show no bound on its latency.
-        has_path = not self.problem.pipeline.has_rates
+        has_path = not self.problem.pipeline.has_rates and self.problem.objective.latency is None
         if self._active is not None and len(self._jobs) and has_path:
             for name, placement in self.problem.candidates.items():
                 estimates[name] = self._at_least(estimates[name], placement, self._active)

@@ -74,6 +74,7 @@ class CellParts:
     controller: ControllerSettings | None = None
     tiers: Mapping[str, Tier] = field(default_factory=dict)
     accelerators: Mapping[str, Tier] = field(default_factory=dict)
+    latency: str | None = None
     live: LiveSettings | None = None
 
 
@@ -417,6 +418,8 @@ def _layers(parts: CellParts, items: Sequence[tuple[str, Disturbance]]) -> Itera
 
 
 def _objective(parts: CellParts) -> Iterator[Fault]:
+    if parts.latency is not None:
+        yield from _unknown("objective.latency", "chain", parts.latency, parts.chains)
     for name in parts.tiers:
         yield from _unknown(f"objective.tiers.{name}", "node", name, parts.nodes)
     counted = accelerator_tiers(parts.nodes, parts.tiers)
