@@ -168,7 +168,7 @@ class Scaling(Learning):
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics (see `Estimator`)."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
-        # No path of a cycle bounds the data age of a chain.
+        # The latency of a cycle bounds no data age.
         has_path = self.problem.objective.latency is None
         if self._active is not None and len(self._jobs) and has_path:
             for name, placement in self.problem.candidates.items():
