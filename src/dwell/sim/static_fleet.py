@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, CellArrays, lay_out
+from dwell.kernels.over_age import over_age
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
@@ -145,7 +146,9 @@ def _result(
         width, closed = problem.window_cycles, int(tables.cells["window"][row])
         first, last = problem.warmup_windows, closed
         latency_ns = tables.latency_ns[row, first * width : last * width]
-        missed.append(latency_ns > problem.pipeline.deadline_ns)
+        release_ns = cell.real.release_ns[: last * width]
+        too_old = over_age(problem.pipeline, release_ns, CellArrays(arrays, row))
+        missed.append((latency_ns > problem.pipeline.deadline_ns) | too_old[first * width :])
         if not used:
             shares = tables.shares[row, first:last, 0].mean(axis=0).tolist()
             resources = problem.fabric.resources.values()
