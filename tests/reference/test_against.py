@@ -75,9 +75,9 @@ from tests.reference.simulator import (
 
 # Instant of a job or a message of a cycle in which there is none.
 NOT_DUE = -2
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "48"))
 # Of the problems that take longer: those with shadows, and those in which orders take time.
-LONGER = int(os.environ.get("DWELL_EXAMPLES", "40"))
+LONGER = int(os.environ.get("DWELL_EXAMPLES", "24"))
 #: One in so many is among the few; `make test-all` tries the others.
 ONE_IN = 4
 FAIR_TOLERANCE_NS = NEAR_NS

@@ -142,15 +142,17 @@ def seen_costs(
     violation_rate: Floats,
     used: Mapping[str, Floats],
     switching: Floats,
+    age_ms: Floats | float = 0.0,
 ) -> Floats:
     """Return J of windows.
 
     Parameters
     ----------
-    l95_ms, violation_rate, switching : float64 array, shape (windows,)
+    l95_ms, violation_rate, switching, age_ms : float64 array, shape (windows,)
         `switching` is the sum of S over the moves that took effect in each window.
     used : mapping of str to float64 array, shape (windows,)
         Busy share of each resource.
     """
     robot, edge, cloud = busiest(used, problem)
-    return price(l95_ms, violation_rate, robot, edge, cloud, switching, problem.objective)
+    objective = problem.objective
+    return price(l95_ms, violation_rate, robot, edge, cloud, switching, objective, age_ms)

@@ -471,6 +471,7 @@ class _Layout:
         resources = problem.fabric.resources.values()
         flows = ordered_flows(pipeline)
         due_ns, grace_ns = close_after_ns(problem)
+        latency = problem.objective.latency
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
             "release_ns": self._addresses(release_ns[None])[0],
@@ -501,6 +502,8 @@ class _Layout:
             "n_flows": len(flows),
             "chain_0": len(self.rows["chains"]),
             "n_chains": len(pipeline.chains),
+            "latency_chain": -1 if latency is None else list(pipeline.chains).index(latency),
+            "weighs_age": problem.objective.weights.age > 0,
             "shadow": -1,
             "parent": -1,
         }

@@ -12,24 +12,27 @@ from dwell.model.pipeline import Pipeline
 
 
 def over_age(
-    pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, by_ns: Ints | int = NEVER_NS - 1
+    pipeline: Pipeline,
+    release_ns: Ints,
+    arrays: CellArrays,
+    cycles: slice,
+    by_ns: Ints | int = NEVER_NS - 1,
 ) -> NDArray[np.bool_]:
-    """Return whether a chain's age at the actuation of each cycle is over its bound.
+    """Return whether a chain's age at the actuation of some cycles is over its bound.
 
     Parameters
     ----------
     release_ns : int64 array
-        Releases of the cycles to look at, from the first one on.
+        Releases of all cycles.
     arrays : CellArrays
-        After the simulation.
-    by_ns : int, or int64 array of the same shape
+        After the simulation of these cycles.
+    by_ns : int, or int64 array with a value per cycle
         Only actuations until this instant count, as at the close of each cycle's window.
     """
-    tables, cycles = arrays.tables, slice(len(release_ns))
-    over = np.zeros(len(release_ns), np.bool_)
+    over = np.zeros(len(release_ns[cycles]), np.bool_)
     for number, chain in enumerate(pipeline.chains.values()):
         if chain.is_bounded:
-            at_ns = tables.actuated_ns[0, number, cycles]
-            age_ns = at_ns - release_ns[tables.actuated_from[0, number, cycles]]
+            at_ns = arrays.tables.actuated_ns[0, number, cycles]
+            age_ns = at_ns - release_ns[arrays.tables.actuated_from[0, number, cycles]]
             over |= (at_ns <= by_ns) & (age_ns > chain.max_age_ns)
     return over

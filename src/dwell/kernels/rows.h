@@ -66,6 +66,7 @@ struct Crossing;  // of meter.cpp
 // `decide_cycles` is the number of cycles between decisions that are more frequent than windows; 0
 // for one decision per window. The next decision looks at cycles before `look_cycle`. `since` is
 // the first cycle under the placement in force, and `look_0` the first decision after it.
+// `latency_chain` is the chain whose data age counts as latency, -1 for none.
 #define DWELL_CELL(field)                                                                        \
   field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
@@ -82,6 +83,7 @@ struct Crossing;  // of meter.cpp
   field(i32, forward_0) field(i32, n_forwards) /* in `forwards` */                               \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
   field(i32, n_flows) field(i32, chain_0) field(i32, n_chains) /* in `chains` */                 \
+  field(i32, latency_chain) field(i32, weighs_age) /* whether `Seen` needs ages */               \
   field(i32, shadow) field(i32, parent)
 
 // A chain of tasks; `last` is the origin of its last actuation. An older age than `max_age_ns` is a
@@ -205,10 +207,11 @@ struct Crossing;  // of meter.cpp
   field(i64, used_ns) field(i64, above_ns)
 
 // Metrics of cycles as known at the end of a window, or when a decision was due. `counted` cycles
-// are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell.
+// are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell. `age_ms` is the mean
+// over time of the age of the newest command, 0 unless the cell `weighs_age`.
 #define DWELL_SEEN(field)                                                                        \
   field(i64, first_cycle) field(i64, cycles) field(i64, missed) field(i64, counted)              \
-  field(f64, l95_ms) field(f64, uncut_ms)
+  field(f64, l95_ms) field(f64, uncut_ms) field(f64, age_ms)
 
 // Numbers by which a built-in policy with the estimator `profile` decides (rules.h): the policy's
 // parameters and the objective's, the placements of the cell, and the sums of `ATP` since its last
@@ -294,6 +297,7 @@ struct Crossing;  // of meter.cpp
 #define DWELL_FOUND(field)                                                                       \
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
+  field(const i64*, more_ns) /* patience beyond the limit, null for none */                      \
   field(Crossing*, crossings) field(i64, n_crossings)
 
 // The values of a part from a single window: their number, and the sums of their places.

@@ -284,10 +284,15 @@ class Pipeline:
         return max(rates[name] for name in self.sinks)
 
     @property
+    def due_interval(self) -> int:
+        """Most cycles from a cycle in which a sink is due to the next such cycle."""
+        rates = self.rates
+        return min(rates[name] for name in self.sinks)
+
+    @property
     def has_idle_cycles(self) -> bool:
         """Whether no sink is due in some cycles."""
-        rates = self.rates
-        return min(rates[name] for name in self.sinks) > 1
+        return self.due_interval > 1
 
     def chain_cycles(self, chain: Chain) -> int:
         """Cycles from one origin to the next that a chain's actuations may differ by.

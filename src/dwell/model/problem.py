@@ -10,7 +10,7 @@ from typing import NamedTuple
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, Bound, counted, require
-from dwell.model.chain import ChainPatience
+from dwell.model.chain import Chain, ChainPatience
 from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import Fabric
@@ -127,6 +127,10 @@ class Problem(Displayed):
         bound = f"at least {rates[slowest]}, so that {slowest} runs in each window"
         holds = rates[slowest] <= self.window_cycles
         require(holds, "window_cycles", self.window_cycles, bound)
+        if (chain := self.latency_chain) is not None:
+            every, rate = self.decide_cycles, rates[chain.target]
+            bound = f"at least {rate}, the interval of {chain.target}, whose age objective.latency"
+            require(rate <= every, "controller.decide_cycles", every, f"{bound} names")
         framed = self.live.release == "frames" and max(rates.values()) > 1
         bound = "timer in a cell with `every`, because each frame releases a cycle"
         require(not framed, "live.release", self.live.release, bound)
@@ -159,6 +163,7 @@ class Problem(Displayed):
             controller=self.controller,
             tiers=self.objective.tiers,
             accelerators=self.objective.accelerators,
+            latency=self.objective.latency,
             live=self.live,
         )
 
@@ -218,6 +223,11 @@ class Problem(Displayed):
         return self.window_cycles * self.pipeline.period_ms
 
     @property
+    def due_cycles(self) -> int:
+        """Fewest cycles of a window in which a sink is due."""
+        return self.window_cycles // self.pipeline.due_interval
+
+    @property
     def window_ns(self) -> int:
         """Length of a window, nanoseconds."""
         return self.window_cycles * self.pipeline.period_ns
@@ -258,13 +268,24 @@ class Problem(Displayed):
         return (self.min_dwell_decisions + 1) * self.decide_cycles
 
     @property
+    def latency_chain(self) -> Chain | None:
+        """Chain whose data age counts as latency, if any."""
+        name = self.objective.latency
+        return None if name is None else self.pipeline.chains[name]
+
+    @property
     def censor_ms(self) -> float:
         """Largest latency in J: max(4 D, 2 P), at least L_max; J cuts longer latencies to it.
 
-        docs/concepts.md explains the reason.
+        If a chain's data age counts as latency: max(4 max_age, or 4 D without max_age, 2 n P), n
+        being the rate of the chain's last task. docs/concepts.md explains the reason.
         """
-        pipeline, cap_ms = self.pipeline, self.objective.caps.latency_ms
-        bound_ms = max(4 * pipeline.deadline_ms, 2 * pipeline.period_ms)
+        pipeline, cap_ms, chain = self.pipeline, self.objective.caps.latency_ms, self.latency_chain
+        usual_ms, every = pipeline.deadline_ms, 1
+        if chain is not None:
+            every = pipeline.rates[chain.target]
+            usual_ms = chain.max_age_ms if math.isfinite(chain.max_age_ms) else usual_ms
+        bound_ms = max(4 * usual_ms, 2 * every * pipeline.period_ms)
         return max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
 
     @property

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, CellArrays, lay_out
+from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.over_age import over_age
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
@@ -26,8 +27,8 @@ class StaticRun(NamedTuple):
 
     Parameters
     ----------
-    missed : list of bool array, shape (cycles,)
-        Whether each cycle missed, by cell.
+    missed : list of bool array, shape (due cycles,)
+        Whether each cycle missed, by cell, without idle cycles.
     used : mapping of str to float
         Utilisation of the shared resources.
     """
@@ -145,10 +146,11 @@ def _result(
         problem, tables = cell.problem, arrays.tables
         width, closed = problem.window_cycles, int(tables.cells["window"][row])
         first, last = problem.warmup_windows, closed
-        latency_ns = tables.latency_ns[row, first * width : last * width]
-        release_ns = cell.real.release_ns[: last * width]
-        too_old = over_age(problem.pipeline, release_ns, CellArrays(arrays, row))
-        missed.append((latency_ns > problem.pipeline.deadline_ns) | too_old[first * width :])
+        cycles = slice(first * width, last * width)
+        is_due = tables.outcome[row, cycles] != CycleOutcome.IDLE
+        late = tables.latency_ns[row, cycles] > problem.pipeline.deadline_ns
+        late |= over_age(problem.pipeline, cell.real.release_ns, CellArrays(arrays, row), cycles)
+        missed.append(late[is_due])
         if not used:
             shares = tables.shares[row, first:last, 0].mean(axis=0).tolist()
             resources = problem.fabric.resources.values()

@@ -188,6 +188,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
     _require_one_rate(problem)
+    _require_latencies(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -347,6 +348,20 @@ def _require_one_rate(problem: Problem) -> None:
                 for key in keys
             )
         )
+
+
+def _require_latencies(problem: Problem) -> None:
+    """Raise a LiveError if J needs ages, which live windows do not have."""
+    objective = problem.objective
+    keys = {"latency": objective.latency is not None, "weights.age": objective.weighs_age}
+    lines = [
+        f"objective.{key}: not supported in the live cell {problem.name}; only the simulator "
+        "measures ages: remove it, or use dwell run"
+        for key, there in keys.items()
+        if there
+    ]
+    if lines:
+        raise LiveError("\n".join(lines))
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
