@@ -14,7 +14,7 @@ from dwell.estimators.pool import PlaceSums, Reference
 from dwell.model import AR1, LogNormal, Normal
 
 rng = random.Random(1)
-#: Exact logarithms take 0.1 ms each. These 10,000 have three whose `math.log1p` differs without FMA.
+#: Exact logarithms take 0.1 ms each. Of these 10,000 three have another `math.log1p` without FMA.
 MOMENTS = [(rng.uniform(1e-3, 1e3), rng.uniform(1e-4, 10)) for _ in range(20_000)][10_000:]
 
 

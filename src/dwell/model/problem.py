@@ -311,13 +311,16 @@ class Problem(Displayed):
         """Node whose agent relays small messages if a direct link fails."""
         return self.live.relay or self.controller_node
 
-    @property
-    def max_age_ms(self) -> float:
-        """Largest age of a command that an actuator receives; by default max(2 P, D + P)."""
+    def max_age_ms(self, task: str) -> float:
+        """Return the largest age of a sink's commands, or of a source's frames.
+
+        By default max(2 nP, D + nP) for a task that runs in every n-th cycle.
+        """
         given_ms, pipeline = self.live.max_age_ms, self.pipeline
         if given_ms is not None:
             return given_ms
-        return max(2 * pipeline.period_ms, pipeline.deadline_ms + pipeline.period_ms)
+        interval_ms = pipeline.rates[task] * pipeline.period_ms
+        return max(2 * interval_ms, pipeline.deadline_ms + interval_ms)
 
     @property
     def guard_patience_ns(self) -> int:

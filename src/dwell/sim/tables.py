@@ -11,7 +11,16 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms, moved_shares, overtaken_cycles, seen_costs
+from dwell.control import (
+    NO_AGE,
+    Controller,
+    age_l95_ms,
+    age_missed,
+    final_l95_ms,
+    moved_shares,
+    overtaken_cycles,
+    seen_costs,
+)
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.over_age import over_age
@@ -22,7 +31,7 @@ from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
-from dwell.sim.chain_ages import NO_AGE, age_l95_ms, age_missed, chain_ages_ns
+from dwell.sim.chain_ages import chain_ages_ns
 
 if TYPE_CHECKING:
     import polars as pl
