@@ -92,7 +92,7 @@ def _off(price: tuple[float, float], true: tuple[float, float]) -> Off:
 def measure(quick: bool) -> Section:
     """Differences of prices and of estimates from simulated runs, with and without rates."""
     cells, faulty = QUICK if quick else (PRICED, FAULTY)
-    figures = []
+    figures: list[Figure] = []
     for make, what in ((rated_cell, "several rates"), (random_cell, "one rate")):
         rows = [row for number in range(cells) for row in priced(make(number))]
         figures += _within(what, rows)
