@@ -110,11 +110,11 @@ def age_l95_ms(ages_ns: Ints) -> Floats:
     return l95
 
 
-def age_missed(ages_ns: Ints, max_age_ms: float) -> Floats:
+def age_missed(ages_ns: Ints, max_age_ns: int) -> Floats:
     """Return the share of each window's actuations with a larger age; 1 without actuations."""
     is_known = ages_ns != NO_AGE
     count = is_known.sum(axis=1)
-    over: NDArray[np.bool_] = is_known & (ages_ns > max_age_ms * 1e6)
+    over: NDArray[np.bool_] = is_known & (ages_ns > max_age_ns)
     share: Floats = np.where(count > 0, over.sum(axis=1) / np.maximum(count, 1), 1.0)
     return share
 

@@ -45,7 +45,7 @@ class DataAges:
         for name, chain in self._chains.items():
             ages_ns = self._ages(chain, cycles, known.get(name, 0))[0][None]
             found[f"age_l95_{name}"] = float(age_l95_ms(ages_ns)[0])
-            found[f"age_missed_{name}"] = float(age_missed(ages_ns, chain.max_age_ms)[0])
+            found[f"age_missed_{name}"] = float(age_missed(ages_ns, chain.max_age_ns)[0])
         return found
 
     def _ages(self, chain: Chain, cycles: Sequence[LiveCycle], origin_ns: int) -> tuple[Ints, int]:
