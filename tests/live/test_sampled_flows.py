@@ -180,6 +180,41 @@ def test_a_task_with_sampled_inputs_alone_is_released_like_a_source() -> None:
     assert log.samples[-1] is not None
 
 
+def test_three_rates_survive_the_death_of_each_worker() -> None:
+    on = {"R": {"exec_ms": 1}}
+    spare = {"R": {"exec_ms": 1, "standby": 1}}
+    tasks = {
+        "camera": {"every": 2 * SLOW, "on": on},
+        "lidar": {"every": SLOW, "on": on},
+        "imu": {"on": on},
+        "detect": {"on": on},
+        "control": {"on": spare},
+    }
+    flows = [
+        {"from": "camera", "to": "detect"},
+        {"from": "imu", "to": "control"},
+        {"from": "detect", "to": "control", "sampled": True},
+        {"from": "lidar", "to": "control", "sampled": True},
+    ]
+    problem = sampling(tasks=tasks, flows=flows, candidates={"LOC": {}}, controller={"on": "E"})
+    world, log = logged(problem)
+    world.run(500)
+    world.kill("detect@R")
+    world.run(300)
+    begun = len(world.cycles)
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}
+    assert log.samples[-1] == log.samples[-20]
+    world.start("detect@R")
+    world.kill("control@R")
+    world.run(500)
+    most = problem.controller.guard_cycles + 1
+    gaps = {later - earlier - 1 for earlier, later in pairwise(world.cycles)}
+    assert max(gaps) <= most
+    assert len(world.cycles) > begun + 40
+    assert log.inputs[-1].keys() == {"imu", "detect", "lidar"}
+    assert log.samples[-1] != log.samples[-20]
+
+
 #: Messages that arrive after those of the next run.
 OVERTAKEN = NetworkConditions(reordering=1.0, reorder_ns=80 * MS)
 
