@@ -181,9 +181,9 @@ def test_a_task_with_sampled_inputs_alone_is_released_like_a_source() -> None:
 
 
 def test_three_rates_survive_the_death_of_each_worker() -> None:
-    on = {"R": {"exec_ms": 1}}
-    spare = {"R": {"exec_ms": 1, "standby": 1}}
-    tasks = {
+    on: dict[str, Any] = {"R": {"exec_ms": 1}}
+    spare: dict[str, Any] = {"R": {"exec_ms": 1, "standby": 1}}
+    tasks: dict[str, Any] = {
         "camera": {"every": 2 * SLOW, "on": on},
         "lidar": {"every": SLOW, "on": on},
         "imu": {"on": on},
@@ -220,8 +220,9 @@ OVERTAKEN = NetworkConditions(reordering=1.0, reorder_ns=80 * MS)
 
 
 def test_a_join_that_no_sink_waits_for_keeps_overlapping_cycles() -> None:
-    tasks = {name: {"on": {"R": {"exec_ms": 1}}} for name in ("imu", "detect", "control")}
-    tasks |= {name: {"every": SLOW, **tasks["imu"]} for name in ("camera", "lidar")}
+    on: dict[str, Any] = {"on": {"R": {"exec_ms": 1}}}
+    tasks = dict.fromkeys(("imu", "detect", "control"), on)
+    tasks |= dict.fromkeys(("camera", "lidar"), {"every": SLOW, **on})
     flows = [
         {"from": "camera", "to": "detect"},
         {"from": "lidar", "to": "detect"},
@@ -292,6 +293,20 @@ def test_recorded_ages_are_those_of_the_jobs(tmp_path: Path) -> None:
         assert l95_ms == pytest.approx(sorted(ages)[18])
         assert missed == sum(age > 50 for age in ages) / 20
     assert any(missed for _, _, missed in windows)
+
+
+def test_a_cycle_whose_data_are_too_old_is_missed() -> None:
+    world, _ = logged(sampling(chains=CHAINS), policy=Staying())
+    world.run(1_000)
+    windows = columns(world, "windows", "first_cycle", "violation_rate", "age_missed_see-act")
+    windows = windows[1:]
+    # At the command just before a new detection the picture is over 50 ms old.
+    assert {missed for _, _, missed in windows} == {0.2}
+    assert {rate for _, rate, _ in windows} == {0.2}
+    rows = columns(world, "cycles", "number", "missed")[windows[0][0] :]
+    assert {number % SLOW for number, missed in rows if missed} == {0}
+    seen = columns(world, "decisions", "seen_violation_rate")
+    assert max(rate for (rate,) in seen) == 0.2
 
 
 def test_the_guard_leaves_a_placement_whose_detector_is_dead() -> None:
