@@ -220,9 +220,9 @@ OVERTAKEN = NetworkConditions(reordering=1.0, reorder_ns=80 * MS)
 
 
 def test_a_join_that_no_sink_waits_for_keeps_overlapping_cycles() -> None:
-    on: dict[str, Any] = {"on": {"R": {"exec_ms": 1}}}
-    tasks = dict.fromkeys(("imu", "detect", "control"), on)
-    tasks |= dict.fromkeys(("camera", "lidar"), {"every": SLOW, **on})
+    on = {"R": {"exec_ms": 1}}
+    tasks: dict[str, Any] = {name: {"on": on} for name in ("imu", "detect", "control")}
+    tasks |= {name: {"every": SLOW, **tasks["imu"]} for name in ("camera", "lidar")}
     flows = [
         {"from": "camera", "to": "detect"},
         {"from": "lidar", "to": "detect"},
