@@ -21,8 +21,10 @@ from dwell.model.problem import Problem
 NO_AGE = -1
 
 
-def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:
-    """Count the cycles that are later than D, or unfinished at the end of their window.
+def missed_cycles(
+    latency_ns: Ints, age_ns: Ints, deadline_ns: int, over_age: NDArray[np.bool_] | None = None
+) -> Ints | int:
+    """Count the cycles that are later than D, unfinished at the end of their window, or over age.
 
     Parameters
     ----------
@@ -32,12 +34,16 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
         Time from each cycle's release to the end of its window.
     deadline_ns : int
         D.
+    over_age : bool array, shape (..., W), optional
+        Whether the data of each cycle's actuation were too old.
 
     Returns
     -------
     int, or int64 array of shape (...)
     """
     late = latency_ns > np.minimum(age_ns, deadline_ns)
+    if over_age is not None:
+        late = late | over_age
     # For one window, counting without an axis is several times faster.
     if late.ndim == 1:
         return int(np.count_nonzero(late))
