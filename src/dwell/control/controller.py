@@ -204,7 +204,6 @@ class Controller:
         #: The incumbent whose windows are compared with its estimates.
         self._watched, self._watchdog = "", Watchdog(problem.window_cycles)
         self._doubts = Doubts(problem.window_cycles)
-        self._due_cycles = problem.due_cycles
         #: Last measured metrics under each candidate.
         self._seen_under: dict[str, QoS] = {}
         #: Cycles of the current decision, as the engine counts them.
@@ -482,7 +481,7 @@ class Controller:
         deviations = self._estimator.deviations(incumbent)
         if deviations is None:
             return
-        played = Expected.of_estimate(estimate, deviations, self._due_cycles)
+        played = Expected.of_estimate(estimate, deviations, self.problem.due_cycles)
         if self._watchdog.compare(seen, played):
             self._doubts.change(incumbent, last_cycle, trusts=self._watchdog.trusts)
 
