@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 27_132, "live": 15_991, "lab": 6_819}
+MOST = {"simulator": 27_183, "live": 16_013, "lab": 6_819}
 
 
 def code_lines(text: str) -> int:
