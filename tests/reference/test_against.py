@@ -773,7 +773,7 @@ def play_stamped(
 
     metrics: list[tuple[float | None, ...]] = [
         (l95_ms, missed / max(counted, 1), None)
-        for _, _, missed, counted, l95_ms, _ in arrays.tables.seen[0].tolist()
+        for _, _, missed, counted, l95_ms, *_ in arrays.tables.seen[0].tolist()
     ]
     tables, _ = make_tables(
         sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics, never),
