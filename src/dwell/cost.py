@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 from dwell.errors import MetricError, PlacementError
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
-from dwell.model.qos import QoS
+from dwell.model.qos import NO_ERROR, QoS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +36,7 @@ __all__ = [
     "ERRORS",
     "GAIN_TOLERANCE",
     "SATURATED",
+    "SELECTED",
     "TierNodes",
     "TierUtilisation",
     "busiest",
@@ -46,6 +47,7 @@ __all__ = [
     "excess",
     "hamming",
     "margin",
+    "margin_errors",
     "price",
     "tier_nodes",
     "tier_utilisation",
@@ -57,6 +59,18 @@ Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 SATURATED = 0.995
 #: Number of standard errors in the `margin` of two estimates.
 ERRORS = 1.0
+#: Number of standard errors of a difference by which the best of K estimates with `QoS.paired` must
+#: be better, by K from 1: sqrt(2 ln K), the largest error to expect of K.
+SELECTED = (
+    0.0,
+    1.1774100225154747,
+    1.4823038073675112,
+    1.6651092223153954,
+    1.7941225779941015,
+    1.8930184728248454,
+    1.9727697022487511,
+    2.039333980337618,
+)
 #: A gain must exceed a threshold by more than this, or rounding could cause a move.
 GAIN_TOLERANCE = 1e-9
 
@@ -230,6 +244,18 @@ def cost_error(error: tuple[float, float] | None, objective: Objective) -> float
         weights.latency * (l95_ms / objective.targets.latency_ms)
         + weights.violations * violation_rate
     )
+
+
+def margin_errors(qos: QoS, candidates: int) -> tuple[float, float]:
+    """Return the errors of L95 (ms) and V_D of an estimate for `margin`.
+
+    Estimates with paired errors have these, `SELECTED` times; the incumbent's are 0.
+    """
+    if qos.paired is None:
+        return qos.error or NO_ERROR
+    l95_ms, violation_rate = qos.paired
+    errors = SELECTED[min(candidates, len(SELECTED)) - 1]
+    return errors * l95_ms, errors * violation_rate
 
 
 def margin(one: float, other: float) -> float:

@@ -94,13 +94,14 @@ def run(
     if seconds is not None:
         windows = windows_of(seconds, problem)
     windows = windows or 300
-    from dwell.estimators import unplayed
+    from dwell.estimators import searched, unplayed
     from dwell.record import require_free
     from dwell.sim import describe
     from dwell.study.other_placements import PLACEMENTS, other_placements
     from dwell.study.summary import summarise
     from dwell.study.verdict import verdict_of
 
+    problem = searched(problem)
     policy = policy or problem.controller.policy
     folder = out or default_folder(problem.name, scenario, policy, str(seed), *(settings or ()))
     require_free(folder)

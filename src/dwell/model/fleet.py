@@ -263,6 +263,10 @@ def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -
         if cell is not None and cell.pipeline.has_rates:
             message = f"{cell.name} has `every` or `sampled`, which fleets do not support"
             yield Fault(f"cells[{place}].cell", f"{message}; remove them, or simulate it alone")
+        if cell is not None and cell.is_searched:
+            message = f"{cell.name} has `candidates: all`, which fleets do not support"
+            remedy = "paste the block of `dwell candidates CELL --yaml`"
+            yield Fault(f"cells[{place}].cell", f"{message}; {remedy}")
     for i, name in enumerate(shared):
         if name in shared[:i]:
             yield Fault(f"shared[{i}]", f"{name!r} is given twice; name each once")

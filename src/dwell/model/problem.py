@@ -12,6 +12,7 @@ from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, Bound, counted, require
 from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
+from dwell.model.every_placement import EveryPlacement
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
 from dwell.model.instants import require_length
@@ -77,6 +78,9 @@ class Problem(Displayed):
     )
     live: LiveSettings = key(
         "Hosts and habits of the live runtime.", default_factory=LiveSettings, tier="first"
+    )
+    every_placement: EveryPlacement | None = key(
+        "Search that adds the cheapest of all placements to the candidates.", default=None
     )
     #: The cell file's folder, searched first for classes named ``package.module:Class``. Equality
     #: ignores it.
@@ -155,6 +159,7 @@ class Problem(Displayed):
             scales=pipeline.scales,
             chains=pipeline.chains,
             candidates=self.candidates,
+            every_placement=self.every_placement,
             scenarios={
                 name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
                 for name, items in self.scenarios.items()
@@ -176,8 +181,13 @@ class Problem(Displayed):
 
     @property
     def initial(self) -> str:
-        """Name of the candidate that a run starts with."""
-        return self.controller.initial or next(iter(self.candidates))
+        """Name of the candidate that a run starts with; empty if only a search finds it."""
+        return self.controller.initial or next(iter(self.candidates), "")
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether a search must still add candidates (`dwell.estimators.searched`)."""
+        return self.every_placement is not None and not self.every_placement.is_found
 
     def policy_and_estimator(self, name: str) -> tuple[str, str | None]:
         """Split a name as ``cusum+corrected`` into policy and estimator.

@@ -38,6 +38,9 @@ class QoS:
     error : tuple of float, optional
         Standard errors of `l95_ms` (milliseconds) and of `violation_rate`; finite, at least 0.
         None if unknown, which counts as 0.
+    paired : tuple of float, optional
+        In a cell whose candidates come from a search: standard errors of the differences of
+        `l95_ms` and `violation_rate` from the incumbent's estimates on the same samples.
 
     Raises
     ------
@@ -50,6 +53,7 @@ class QoS:
     utilisation: Mapping[str, float]
     cut_from_ms: float | None = None
     error: tuple[float, float] | None = None
+    paired: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         l95_ms, cut_from_ms = self.l95_ms, self.cut_from_ms
@@ -70,8 +74,8 @@ class QoS:
                 )
             if cut_from_ms == l95_ms:
                 object.__setattr__(self, "cut_from_ms", None)
-        if self.error is not None:
-            for metric, value in zip(("l95_ms", "violation_rate"), self.error, strict=True):
+        for errors in (one for one in (self.error, self.paired) if one is not None):
+            for metric, value in zip(("l95_ms", "violation_rate"), errors, strict=True):
                 if not 0 <= value < INFINITY:
                     raise MetricError(
                         f"error of {metric} is {value!r}; it must be finite and at least 0"
@@ -85,7 +89,7 @@ class QoS:
         return self.l95_ms if self.cut_from_ms is None else self.cut_from_ms
 
 
-_set_l95_ms, _set_violation_rate, _set_utilisation, _set_cut_from_ms, _set_error = (
+_set_l95_ms, _set_violation_rate, _set_utilisation, _set_cut_from_ms, _set_error, _set_paired = (
     getattr(QoS, name).__set__ for name in QoS.__match_args__
 )
 
@@ -96,6 +100,7 @@ def unchecked_qos(
     utilisation: Mapping[str, float],
     cut_from_ms: float | None,
     error: tuple[float, float] | None = None,
+    paired: tuple[float, float] | None = None,
 ) -> QoS:
     """Make a QoS without checks, in a third of the time.
 
@@ -108,6 +113,7 @@ def unchecked_qos(
     _set_utilisation(qos, utilisation)
     _set_cut_from_ms(qos, cut_from_ms)
     _set_error(qos, error)
+    _set_paired(qos, paired)
     return qos
 
 

@@ -18,6 +18,7 @@ from dwell.cost import (
     excess,
     hamming,
     margin,
+    margin_errors,
     price,
     tier_nodes,
 )
@@ -143,9 +144,8 @@ class Pricing:
         """Return the least difference in J of two estimates that exceeds their error."""
         if one.error is None and other.error is None:
             return 0.0
-        return margin(
-            cost_error(one.error, self.objective), cost_error(other.error, self.objective)
-        )
+        errors = (margin_errors(qos, len(self.candidates)) for qos in (one, other))
+        return margin(*(cost_error(error, self.objective) for error in errors))
 
     def eligible(self, estimates: Mapping[str, QoS]) -> tuple[list[str], bool]:
         """Return the candidates to choose from, and whether they respect the caps.

@@ -153,8 +153,10 @@ def roles(problem: Problem) -> tuple[Role, ...]:
     """Return every process of a cell, in the order of the ports.
 
     Later processes connect to earlier processes. Processes that rarely restart are first, then the
-    workers along the flows, and last the controller, which may start and stop at any time.
+    workers along the flows, and last the controller, which may start and stop at any time. Raises a
+    LiveError if a search must still add candidates.
     """
+    require_candidates(problem)
     pipeline = problem.pipeline
     order = pipeline.topological()
     stamper = problem.stamper_node
@@ -331,6 +333,15 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             stops = not problem.pipeline.outputs(other.task)
             return stops or (other.kind == "worker" and not task.anchored)
     return False
+
+
+def require_candidates(problem: Problem) -> None:
+    """Raise a LiveError if a search must still add candidates."""
+    if problem.is_searched:
+        raise LiveError(
+            f"candidates.all: not supported in the live cell {problem.name}; paste the block of "
+            "`dwell candidates CELL --yaml`"
+        )
 
 
 def _require_one_rate(problem: Problem) -> None:
