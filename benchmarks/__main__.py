@@ -28,6 +28,7 @@ BENCHMARKS = {
     "errors": ("stated_errors", "measure"),
     "placements": ("placements", "measure"),
     "schedulers": ("placements", "schedulers"),
+    "all": ("all_candidates", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),

@@ -34,19 +34,33 @@ def with_search(
     )
 
 
-def test_the_candidates_are_the_cheapest_placements() -> None:
-    problem = random_dag(3)
-    found = searched(with_search(problem, keep=3)).candidates
-    best = [placement for placement, _, _ in dwell.search(problem, top=3)]
-    assert found == dict(zip(["A1", "A2", "A3"], best, strict=True))
+def test_the_candidates_are_the_cheapest_without_each_node_and_the_next_cheapest() -> None:
+    problem = with_search(CANONICAL, keep=4)
+    found = searched(problem).candidates
+    ranked = [placement for placement, _, _ in dwell.search(problem, top=4)]
+    tasks = [name for name, task in problem.pipeline.tasks.items() if not task.anchored]
+
+    def cheapest_without(node: str) -> Placement:
+        return next(one for one in ranked if node not in {one[name] for name in tasks})
+
+    first = ranked[0]
+    others = [cheapest_without(node) for node in dict.fromkeys(first[name] for name in tasks)]
+    expected = list(dict.fromkeys((first, *others, *ranked)))
+    assert found == dict(zip(["A1", "A2", "A3", "A4"], expected, strict=True))
+    assert list(found.values()) != ranked
 
 
 def test_named_candidates_are_first_and_not_found_again() -> None:
-    problem = random_dag(3)
-    best = [placement for placement, _, _ in dwell.search(problem, top=4)]
-    found = searched(with_search(problem, 4, {"A2": best[1], "mine": best[2]})).candidates
-    assert list(found) == ["A2", "mine", "A1", "A3"]
-    assert list(found.values()) == [best[1], best[2], best[0], best[3]]
+    problem = with_search(CANONICAL, keep=4)
+    free = list(searched(problem).candidates.values())
+    named = {"A2": free[1], "mine": free[2]}
+    found = searched(with_search(CANONICAL, 4, named)).candidates
+    assert list(found.items()) == [*named.items(), ("A1", free[0]), ("A3", free[3])]
+
+
+def test_all_shadows_together_are_as_many_as_with_three_candidates() -> None:
+    assert searched(with_search(CANONICAL, keep=2)).shadow_fraction == 0.05
+    assert searched(with_search(CANONICAL, keep=4)).shadow_fraction == 0.1 / 3
 
 
 def test_a_cell_is_searched_once() -> None:
@@ -131,8 +145,12 @@ def test_errors_of_differences_are_from_common_samples() -> None:
         assert here.error is not None
         assert qos.paired is not None
         assert 0.0 < qos.paired[0] <= math.hypot(qos.error[0], here.error[0])
-    # The errors are mostly those of the cycles, which are the same.
-    alike = estimates["A2"]
+    # Both detect on R1, so their errors are mostly those of the same cycles.
+    (alike,) = (
+        estimates[name]
+        for name, placement in problem.candidates.items()
+        if name != "A1" and placement["perception"] == problem.candidates["A1"]["perception"]
+    )
     assert alike.error is not None
     assert alike.paired is not None
     assert alike.paired[0] < 0.5 * alike.error[0]

@@ -106,12 +106,10 @@ class Assembly:
         links, flows = list(self._links()), list(self._flows())
         timing = self._timing()
         objective = self._objective(nodes)
-        controller = self._section("controller", ControllerSettings)
-        servo = self._servo()
-        live = self._live(timing)
-        scenarios = self._scenarios()
+        controller, servo = self._section("controller", ControllerSettings), self._servo()
+        live, scenarios = self._live(timing), self._scenarios()
         named, every = entry.candidates.named, self._made(entry.candidates.every)
-        candidates = {name: moves for name, moves in named.items() if moves is not None}
+        candidates = _without_none(named)
         called = name if entry.name is None else entry.name
         parts = CellParts(
             nodes=nodes,

@@ -19,8 +19,7 @@ class EveryPlacement:
     """A search for the cheapest of all placements, made once before a run."""
 
     keep: int = key(
-        "Number of candidates: the named ones first, then the cheapest of all placements as `A1`, "
-        "`A2` and so on.",
+        "Number of candidates: the named ones, then found placements as `A1`, `A2` and so on.",
         KEEP,
         default=8,
         tier="first",

@@ -26,6 +26,8 @@ from dwell.model.servo import Servo
 
 #: Default share of the cycles for each alternative, unless the shares add up to more than 1.
 SHADOWED = 0.05
+#: The same for all alternatives together, where a search adds candidates.
+SHADOWED_TOGETHER = 0.1
 
 
 class Drawn(NamedTuple):
@@ -79,9 +81,8 @@ class Problem(Displayed):
     live: LiveSettings = key(
         "Hosts and habits of the live runtime.", default_factory=LiveSettings, tier="first"
     )
-    every_placement: EveryPlacement | None = key(
-        "Search that adds the cheapest of all placements to the candidates.", default=None
-    )
+    #: Search that adds the cheapest of all placements to the candidates.
+    every_placement: EveryPlacement | None = None
     #: The cell file's folder, searched first for classes named ``package.module:Class``. Equality
     #: ignores it.
     folder: str | None = field(default=None, compare=False, repr=False)
@@ -284,12 +285,15 @@ class Problem(Displayed):
     def shadow_fraction(self) -> float:
         """Largest share of the cycles also sent through each alternative, if the estimator does so.
 
-        With `auto` 0.05, or 1/(alternatives) if that is less; see `dwell.estimators.shadow_price`.
+        With `auto` 0.05, or 1/(alternatives) if that is less, 0.1/(alternatives) if a search adds
+        candidates; see `dwell.estimators.shadow_price`.
         """
         given = self.controller.shadow_fraction
         if not isinstance(given, str):
             return given
-        return min(SHADOWED, 1 / max(len(self.candidates) - 1, 1))
+        alternatives = max(len(self.candidates) - 1, 1)
+        together = 1.0 if self.every_placement is None else SHADOWED_TOGETHER
+        return min(SHADOWED, together / alternatives)
 
     @property
     def controller_node(self) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Literal, TypeAlias
 
-from dwell.errors import LiveError
+from dwell.errors import Fault, LiveError, ProblemError
 from dwell.live.wire.local_addresses import running_elsewhere
 from dwell.live.wire.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.wire.transport import Lane
@@ -154,7 +154,7 @@ def roles(problem: Problem) -> tuple[Role, ...]:
 
     Later processes connect to earlier processes. Processes that rarely restart are first, then the
     workers along the flows, and last the controller, which may start and stop at any time. Raises a
-    LiveError if a search must still add candidates.
+    ProblemError if a search must still add candidates.
     """
     require_candidates(problem)
     pipeline = problem.pipeline
@@ -336,12 +336,11 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
 
 
 def require_candidates(problem: Problem) -> None:
-    """Raise a LiveError if a search must still add candidates."""
+    """Raise a ProblemError if a search must still add candidates."""
     if problem.is_searched:
-        raise LiveError(
-            f"candidates.all: not supported in the live cell {problem.name}; paste the block of "
-            "`dwell candidates CELL --yaml`"
-        )
+        message = f"not supported in the live cell {problem.name}"
+        remedy = "paste the block of `dwell candidates CELL --yaml`"
+        raise ProblemError([Fault("candidates.all", f"{message}; {remedy}")])
 
 
 def _require_one_rate(problem: Problem) -> None:
