@@ -8,6 +8,7 @@ from itertools import pairwise
 
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.placements import Graph, autoware_graph, graph_cell
+from dwell import search
 from dwell.estimators import searched
 from dwell.model import ControllerSettings, Problem
 from dwell.model.every_placement import EveryPlacement
@@ -62,7 +63,7 @@ def measure(quick: bool) -> Section:
     seeds = list(SEEDS)[: 2 if quick else None]
     figures = []
     for problem in list(cells())[: 1 if quick else None]:
-        many, few = costs(problem, 8, seeds), costs(problem, 3, seeds)
+        many, few = costs(with_all(problem), seeds), costs(with_three(problem), seeds)
         for name in many:
             pairs = zip(many[name], few[name], strict=True)
             more = [100 * (one / other - 1) for one, other in pairs]
@@ -83,17 +84,22 @@ def cells() -> Iterator[Problem]:
         yield replace(problem, scenarios=dynamic_scenarios(), controller=controller)
 
 
-def costs(problem: Problem, keep: int, seeds: Sequence[int]) -> Mapping[str, list[float]]:
-    """Return the mean J of each seed, by scenario and policy.
+def with_all(problem: Problem) -> Problem:
+    """Return the problem with `candidates: all`."""
+    return searched(replace(problem, candidates={}, every_placement=EveryPlacement()))
 
-    With 3, the candidates are the three best at baseline, and the margin is as in other cells.
-    """
-    found = searched(replace(problem, candidates={}, every_placement=EveryPlacement(keep)))
-    if keep == 3:
-        found = replace(found, every_placement=None)
-    scenarios = [name for name in found.scenarios if name != "baseline"]
+
+def with_three(problem: Problem) -> Problem:
+    """Return the problem with the three best placements at baseline."""
+    best = search(problem, top=3)
+    return replace(problem, candidates={f"B{k}": one[0] for k, one in enumerate(best, 1)})
+
+
+def costs(problem: Problem, seeds: Sequence[int]) -> Mapping[str, list[float]]:
+    """Return the mean J of each seed, by scenario and policy."""
+    scenarios = [name for name in problem.scenarios if name != "baseline"]
     result = compare(
-        found, scenarios=scenarios, policies=POLICIES, seeds=seeds, windows=WINDOWS, processes=1
+        problem, scenarios=scenarios, policies=POLICIES, seeds=seeds, windows=WINDOWS, processes=1
     )
     return {
         f"{scenario}, {policy.partition('+')[0]}": list(result.values(scenario, policy, "cost"))
