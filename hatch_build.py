@@ -1,9 +1,9 @@
 """Builds the compiled kernel with the package: src/dwell/kernels/*.cpp, as one library.
 
-An editable install has the library beside its sources, a wheel gets it from `build/`. The compiler
-is $CXX, else the first of the system's that knows C++20, else that of the package `ziglang`, which
-isolated builds then ask for. DWELL_WHEEL_PLATFORM=manylinux_2_17_aarch64 has ziglang build a wheel
-for that platform (docs/howto/releasing.md).
+An editable install has the library next to its sources, a wheel gets it from `build/`. The compiler
+is $CXX, else the first system compiler that knows C++20, else the package `ziglang`, which isolated
+builds then require. With DWELL_WHEEL_PLATFORM=manylinux_2_17_aarch64 ziglang builds a wheel for
+that platform (docs/howto/releasing.md).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KERNELS = Path(__file__).resolve().parent / "src" / "dwell" / "kernels"
 FILE = runpy.run_path(str(KERNELS / "library_file.py"))
 
 ZIG = (sys.executable, "-m", "ziglang", "c++")
-#: A library that nothing is taken from, such as that of C++, is not needed later.
+#: Unused libraries, such as the standard library of C++, are not needed at run time.
 LINK = ("-shared", "-static-libgcc", "-Wl,--as-needed", "-Wl,-z,defs", "-Wl,-s")
 PROBE = "#include <bit>\n#include <concepts>\nstatic_assert(std::integral<int>);\n"
 
@@ -39,10 +39,10 @@ NO_WHEEL = f"{NO_COMPILER}: a wheel cannot be built without its kernel; apt-get 
 
 
 class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
-    """Builds the library before a wheel or an editable install is put together."""
+    """Builds the library before a wheel or an editable install."""
 
     def dependencies(self) -> list[str]:
-        """Ask for ziglang where there is no other compiler."""
+        """Require ziglang if there is no other compiler."""
         return [] if find_compiler() else list(self.metadata.config["dependency-groups"]["zig"])
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
@@ -83,16 +83,16 @@ def find_compiler() -> list[str]:
 
 
 def build(compiler: Sequence[str], library: Path, options: Sequence[str] = ()) -> None:
-    """Compile the kernel, but for where the same library is there already.
+    """Compile the kernel, unless the same library exists.
 
     Parameters
     ----------
     compiler : sequence of str
-        Its command.
+        Command of the compiler.
     library : Path
-        What to make; its place has the old library until the new one is done.
+        File of the library; an old one is replaced at the end.
     options : sequence of str
-        Options of the compiler beside those of the kernel.
+        Further options of the compiler.
     """
     version = subprocess.run([*compiler, "--version"], check=True, capture_output=True, text=True)
     name = " ".join([version.stdout.splitlines()[0], *options])
@@ -113,8 +113,8 @@ def build(compiler: Sequence[str], library: Path, options: Sequence[str] = ()) -
 def compile_library(
     compiler: Sequence[str], sources: Iterable[Path], flags: Sequence[str], library: Path
 ) -> str:
-    """Compile and link sources; return what the compiler says where it fails."""
-    # For a link that names it, Zig builds the library of C++ first: half a minute for nothing.
+    """Compile and link sources; return the errors of the compiler."""
+    # If the link names the standard library of C++, Zig builds it first, for half a minute.
     link = [*LINK, "-nostdlib++"] if "ziglang" in compiler else LINK
     with TemporaryDirectory(dir=library.parent, prefix=".build-") as folder:
         objects = {source: Path(folder, f"{source.stem}.o") for source in sources}

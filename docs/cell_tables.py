@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from dwell.cellfile import cell_form, fleet_file
+from dwell.cellfile import cell_form, fleet_file, study_form
 from dwell.cellfile.forms import (
     ChoiceForm,
     FlagForm,
@@ -22,9 +22,10 @@ from dwell.cellfile.forms import (
     TextForm,
     WrittenForm,
 )
+from dwell_lab.testbed import inventory
 
 FOLDER = Path(__file__).parent / "reference"
-FILES = tuple(FOLDER / name for name in ("cells.md", "fleets.md"))
+FILES = tuple(FOLDER / name for name in ("cells.md", "files.md"))
 SHAPES = {
     "the file": cell_form.CELL.shape,
     "a trace": cell_form.TRACE,
@@ -41,6 +42,7 @@ SHAPES = {
     "weights": cell_form.WEIGHTS,
     "targets": cell_form.TARGETS,
     "caps": cell_form.CAPS,
+    "misses": cell_form.MISSES,
     "the controller": cell_form.CONTROLLER,
     "the servo": cell_form.SERVO,
     "its target": cell_form.TARGET,
@@ -50,6 +52,11 @@ SHAPES = {
     "a host": cell_form.HOST,
     "a fleet": fleet_file.FLEET.shape,
     "an entry": fleet_file.ENTRY,
+    "a study": study_form.STUDY.shape,
+    "a study of a fleet": study_form.FLEET_STUDY.shape,
+    "an inventory": inventory.INVENTORY.shape,
+    "a real host": inventory.HOST,
+    "link commands": inventory.LINK,
 }
 PLACE = re.compile(r"<!-- keys of ([^\n]*) -->\n(?:\|[^\n]*\n)*")
 

@@ -112,7 +112,7 @@ HEAD = """# Static placements in the dynamic scenarios
 {measured} `python -m docs.dynamic_tables` wrote
 this page: J and V_D of each placement if it never moves, 20 seeds of 300 windows, the warm-up left
 out; ± is the 95 % interval over seeds. The lowest J is bold if its interval to the next, seed by
-seed, leaves out 0. [Dynamic scenarios](../../docs/background/dynamic-scenarios.md) describes the
+seed, leaves out 0. [Changing scenarios](changing-scenarios.md) describes the
 phases and faults.
 """
 

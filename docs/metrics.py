@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+from dwell.dash.metrics import LATENCY, SENTENCES, SUFFIXES
 from dwell.study.metric import METRICS
 
 PAGE = Path(__file__).with_name("reference") / "metrics.md"
-TEXT = """# Metrics of a run
+TEXT = """# Metrics of runs and of live cells
+
+## Of a run
 
 Columns of a run's summary (`dwell run --json`), of `Comparison.runs` and of a study's
 `runs.parquet`, without the warm-up. Tables show shares in percent; columns have them in [0, 1].
@@ -18,6 +21,16 @@ comparisons with references. `python -m docs.metrics` writes this page.
 | column | name | unit | better |
 |---|---|---|---|
 {rows}
+
+## Of a live cell
+
+Series for [Prometheus](../howto/monitoring.md#numbers-for-prometheus). Each has the label `cell`,
+and labels for its node, task, flow, placement, process, reason or outcome. Unknown values are
+absent, not 0.
+
+| series | kind | meaning |
+|---|---|---|
+{series}
 """
 
 
@@ -29,9 +42,18 @@ def rows() -> Iterator[str]:
         yield f"| `{shown}` | {title} | {metric.unit} | {metric.better} |"
 
 
+def series() -> Iterator[str]:
+    """Yield a row for each series of a live cell."""
+    name, sentence = LATENCY
+    yield f"| `{name}` | histogram | {sentence} |"
+    for kind, sentences in SENTENCES.items():
+        for name, sentence in sentences.items():
+            yield f"| `{name}{SUFFIXES[kind]}` | {kind} | {sentence} |"
+
+
 def page() -> str:
     """Return the page."""
-    return TEXT.format(rows="\n".join(rows()))
+    return TEXT.format(rows="\n".join(rows()), series="\n".join(series()))
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ MODULES = {path.stem for path in SOURCES.glob("[a-z]*.py")}
 
 
 def test_every_room_has_its_sentence() -> None:
-    table = PAGE.partition("## The rooms")[2].partition("\n## ")[0]
-    rooms = re.findall(r"^\| \w* ?\| `(\w+)` \|", table, re.MULTILINE)
+    section = PAGE.partition("## The rooms")[2].partition("\n## ")[0]
+    rooms = re.findall(r"^- `(\w+)`: ", section, re.MULTILINE)
     assert sorted(rooms) == sorted({"dwell_lab"} | PACKAGES | MODULES)
 
 

@@ -15,8 +15,8 @@ import pytest
 import typer.main
 from typer.testing import CliRunner
 
+from docs import api, gallery, messages, site
 from docs import commands as commands_page
-from docs import gallery, site
 from docs import metrics as metrics_page
 from dwell.cli.commands import app
 
@@ -118,6 +118,14 @@ def test_commands_exist(page: Path) -> None:
         elif words[0] == "dwell":
             used = {word.partition("=")[0] for word in words[2:] if word.startswith("--")}
             assert used <= options(words[1]) | {"--help"}
+
+
+def test_the_page_of_public_names_is_the_generated_one() -> None:
+    assert api.PAGE.read_text(encoding="utf-8") == api.page()
+
+
+def test_the_page_of_messages_is_the_generated_one() -> None:
+    assert messages.PAGE.read_text(encoding="utf-8") == messages.page()
 
 
 def test_the_page_of_commands_is_the_generated_one() -> None:

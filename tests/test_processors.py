@@ -56,6 +56,11 @@ def digests(**variables: str) -> dict[str, str]:
     return dict(line.split() for line in done.stdout.splitlines())
 
 
+@pytest.fixture(scope="module")
+def here() -> dict[str, str]:
+    return digests()
+
+
 def numpy_features() -> str:
     """Return what NumPy uses of this processor beyond what all have."""
     config = np.show_config(mode="dicts")
@@ -71,9 +76,9 @@ def numpy_features() -> str:
     ],
 )
 def test_numbers_that_runs_depend_on_are_the_same_on_an_older_processor(
-    control: str, variable: str, value: str
+    here: dict[str, str], control: str, variable: str, value: str
 ) -> None:
-    here, older = digests(), digests(**{variable: value})
+    older = digests(**{variable: value})
     if here[control] == older[control]:
         pytest.skip(f"{variable} changes nothing on this processor")
     for name in here.keys() - set(CONTROLS):

@@ -56,7 +56,7 @@ def __getattr__(name: str) -> Any:
         If it needs a package that is not installed; with the command that installs it.
     """
     if name not in _HOME:
-        # A name of the upper flats (dwell.ros2).
+        # The upper flats may add the name (dwell.ros2).
         return import_module("dwell.model.entry_points").added_name(name)
     try:
         return getattr(import_module(_HOME[name]), name)

@@ -4,11 +4,12 @@ J weighs the four metrics of a window, each relative to its design target, and t
 that moved::
 
     J = a_L * L95 / L_target + a_V * V_D + a_r * U_r / U_r_target + a_e * U_e / U_e_target
-        [+ a_c * U_c / U_c_target] + a_S * S
+        [+ a_c * U_c / U_c_target] [+ a_a * age / age_target] + a_S * S
 
 U_r and U_e are maxima over the tier's nodes, because a mean hides a single saturated robot. They
-include accelerators if the objective counts them. The bracketed term exists only if the objective
-weighs cloud nodes separately; otherwise cloud nodes count as edge nodes.
+include accelerators if the objective counts them. The bracketed terms exist only if the objective
+weighs cloud nodes separately (otherwise cloud nodes count as edge nodes), or weighs the mean age of
+the newest command. L95 is of the data age of a chain if the objective names one.
 
 All arithmetic is in `price`, which takes floats and arrays: one window and an array of thousands
 give the same bits.
@@ -24,7 +25,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from dwell.errors import MetricError, PlacementError
-from dwell.model.objective import Objective
+from dwell.model.objective import MISSES_SHARE, Objective
 from dwell.model.placement import Placement
 from dwell.model.qos import NO_ERROR, QoS
 
@@ -51,6 +52,7 @@ __all__ = [
     "price",
     "tier_nodes",
     "tier_utilisation",
+    "weighed_age_ms",
 ]
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
@@ -167,6 +169,7 @@ def price(
     cloud: Metric | float,
     switching: Metric | float,
     objective: Objective,
+    age_ms: Metric | float = 0.0,
 ) -> Metric:
     """Return J of metrics given as floats or arrays, elementwise (paper, eq. 5 and 7).
 
@@ -182,6 +185,8 @@ def price(
         U_r, U_e, U_c; `cloud` is ignored unless ``objective.weights.cloud`` is given.
     switching : float or array
         S, the share of tasks moved.
+    age_ms : float or array
+        Mean age, milliseconds; ignored unless ``objective.weights.age`` is above 0.
 
     Returns
     -------
@@ -197,6 +202,8 @@ def price(
     )
     if weights.cloud is not None and targets.cloud is not None:
         J = J + weights.cloud * (cloud / targets.cloud)
+    if weights.age and targets.age_ms is not None:
+        J = J + weights.age * (age_ms / targets.age_ms)
     return J + weights.switching * switching
 
 
@@ -218,44 +225,62 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
     Raises
     ------
     MetricError
-        If the utilisation of a node of ``objective.tiers`` is missing, or J is not finite.
+        If the utilisation of a node of ``objective.tiers``, or a weighed age, is missing, or J is
+        not finite.
     PlacementError
         If the placements cover different tasks.
     """
     robot, edge, cloud = tier_utilisation(qos.utilisation, objective)
     switching = hamming(current, previous)
-    J = float(price(qos.l95_ms, qos.violation_rate, robot, edge, cloud, switching, objective))
+    age_ms = weighed_age_ms(qos, objective)
+    rate = qos.violation_rate
+    J = float(price(qos.l95_ms, rate, robot, edge, cloud, switching, objective, age_ms))
     if not math.isfinite(J):
         raise MetricError(f"J is {J!r} for {qos}; a metric is too large for its weight and target")
     return J
 
 
-def cost_error(error: tuple[float, float] | None, objective: Objective) -> float:
-    """Return the standard error of an estimate's J from the errors of L95 and V_D (`QoS.error`).
+def weighed_age_ms(qos: QoS, objective: Objective) -> float:
+    """Return the mean age of a QoS as J needs it: 0 if J has no term of it.
 
-    The two terms are added, not combined in quadrature: L95 and V_D come from the same cycles and
-    err in the same direction. The sum is the largest error that any correlation gives.
+    Raises MetricError if it is missing.
+    """
+    if not objective.weighs_age:
+        return 0.0
+    if qos.age_ms is None:
+        raise MetricError("age_ms is missing; J needs it where weights.age is above 0")
+    return qos.age_ms
+
+
+def cost_error(
+    error: tuple[float, float] | None, objective: Objective, age_error_ms: float = 0.0
+) -> float:
+    """Return the standard error of an estimate's J from the errors of its metrics (see `QoS`).
+
+    The terms are added, not combined in quadrature: L95, V_D and the age come from the same cycles
+    and err in the same direction. The sum is the largest error that any correlation gives.
     """
     if error is None:
         return 0.0
     l95_ms, violation_rate = error
-    weights = objective.weights
-    return (
-        weights.latency * (l95_ms / objective.targets.latency_ms)
-        + weights.violations * violation_rate
-    )
+    weights, targets = objective.weights, objective.targets
+    known = weights.latency * (l95_ms / targets.latency_ms) + weights.violations * violation_rate
+    if weights.age and targets.age_ms is not None:
+        known += weights.age * (age_error_ms / targets.age_ms)
+    return known
 
 
-def margin_errors(qos: QoS, candidates: int) -> tuple[float, float]:
-    """Return the errors of L95 (ms) and V_D of an estimate for `margin`.
+def margin_errors(qos: QoS, candidates: int) -> tuple[float, float, float]:
+    """Return the errors of L95 (ms), V_D and age (ms) of an estimate for `margin`.
 
-    Estimates with paired errors have these, `SELECTED` times; the incumbent's are 0.
+    Estimates with paired errors have these, `SELECTED` times; the incumbent's are 0. Ages have no
+    paired errors.
     """
     if qos.paired is None:
-        return qos.error or NO_ERROR
+        return *(qos.error or NO_ERROR), qos.age_error_ms
     l95_ms, violation_rate = qos.paired
     errors = SELECTED[min(candidates, len(SELECTED)) - 1]
-    return errors * l95_ms, errors * violation_rate
+    return errors * l95_ms, errors * violation_rate, errors * qos.age_error_ms
 
 
 def margin(one: float, other: float) -> float:
@@ -299,13 +324,14 @@ def busiest(qos: QoS) -> float:
 
 
 def excess(qos: QoS, objective: Objective) -> float:
-    """Return the largest relative excess over the caps L_max and U_max (constraints of eq. 8).
+    """Return the largest relative excess over the caps (constraints of eq. 8).
 
     Returns
     -------
     float
-        Maximum of ``value / cap - 1`` over the uncut L95 (a lost cycle exceeds every cap) and the
-        utilisation of every resource in `qos` (see `busiest`). Above 0 if and only if a cap is
+        Maximum of ``value / cap - 1`` over the uncut L95 (a lost cycle exceeds every cap), the
+        utilisation of every resource in `qos` (see `busiest`), and its share of stretches with too
+        many misses, if known and capped. Above 0 if and only if a cap is
         exceeded.
     """
     caps = objective.caps
@@ -313,4 +339,6 @@ def excess(qos: QoS, objective: Objective) -> float:
     latency = qos.uncut_l95_ms / caps.latency_ms if caps.latency_ms < math.inf else 0.0
     # Faster than max(); this runs for every candidate in every window.
     load = busiest(qos) / caps.utilisation
+    if caps.misses is not None and qos.misses is not None:
+        load = max(load, qos.misses / MISSES_SHARE)
     return (load if load > latency else latency) - 1.0

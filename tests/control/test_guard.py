@@ -24,6 +24,7 @@ from dwell.control import (
 from dwell.cost import hamming
 from dwell.errors import PolicyError, ProblemError
 from dwell.model import Decision, FrozenDict, QoS
+from dwell.model.chain import ChainPatience
 from dwell.model.instants import EVIDENCE_NS
 from tests.cells.deterministic import cell
 
@@ -87,6 +88,23 @@ def test_gaps_in_the_numbers_are_no_silence() -> None:
     assert mine.due_ns is None
 
 
+def test_idle_cycles_are_not_waited_for_but_shorten_a_rest() -> None:
+    mine = guard(h=4)
+    mine.released(0, 0, is_idle=True)
+    assert mine.due_ns is None
+    mine.released(1, P)
+    assert mine.due_ns == P + 3 * P
+    mine.adopt("LOC", fallback=True)
+    mine.released(2, 5 * P)
+    mine.released(3, 6 * P, is_idle=True)
+    mine.completed(2, 6 * P)
+    mine.released(4, 7 * P, is_idle=True)
+    mine.released(5, 8 * P)
+    assert mine.due_ns is None  # the rest has been four cycles, two of them idle
+    mine.released(6, 9 * P)
+    assert mine.due_ns == 12 * P
+
+
 def test_numbers_that_do_not_grow_and_completions_of_nothing_released_are_ignored() -> None:
     mine = guard()
     released(mine, [10, 11])
@@ -148,9 +166,10 @@ def test_no_fallbacks_no_guard() -> None:
 
 @pytest.mark.parametrize(("name", "value"), [("patience_ns", 0), ("probe_cycles", 0)])
 def test_settings_out_of_their_range_are_refused(name: str, value: int) -> None:
-    settings = {"patience_ns": 3 * P, "probe_cycles": 5, name: value}
+    of = {"patience_ns": 3 * P, "probe_cycles": 5, name: value}
+    patience_ns, probe_cycles = of["patience_ns"], of["probe_cycles"]
     with pytest.raises(ProblemError, match=name):
-        Guard(("LOC",), **settings, placement="SO")
+        Guard(("LOC",), patience_ns=patience_ns, probe_cycles=probe_cycles, placement="SO")
 
 
 def test_it_keeps_no_more_than_it_needs_while_nothing_completes() -> None:
@@ -879,3 +898,72 @@ def test_a_policy_that_cannot_be_told_hears_what_it_lacks() -> None:
     controller.adopt("OFF")
     with pytest.raises(PolicyError, match=r"needs adopt\(name\)"):
         decide(controller)
+
+
+# -------------------------------------------------------------------------------------- chains
+
+
+def chained(*fallbacks: str, every: int = 2, patience: int = 8, h: int = 5) -> Guard:
+    """A guard of cycles (3 periods) and of a chain with an origin in each `every`-th cycle."""
+    return Guard(
+        fallbacks or ("LOC", "HYB"),
+        patience_ns=3 * P,
+        probe_cycles=h,
+        placement="SO",
+        chains={"see": ChainPatience(patience * P, every)},
+    )
+
+
+def test_the_age_of_the_newest_origin_counts_while_cycles_complete() -> None:
+    mine = chained()
+    for cycle in range(8):
+        mine.released(cycle, cycle * P)
+        mine.completed(cycle, cycle * P)
+    assert (mine.chains, mine.due_ns) == (("see",), 8 * P)
+    mine.actuated("see", 4)
+    assert mine.due_ns == 4 * P + 8 * P
+    mine.actuated("see", 2)
+    assert not fires(mine, 12 * P - 1)
+    assert fires(mine, 12 * P)
+
+
+def test_a_placement_carries_the_cell_once_the_chain_has_actuated_from_it() -> None:
+    mine = chained("LOC", "HYB", h=2)
+    for cycle in range(9):
+        mine.released(cycle, cycle * P)
+        mine.completed(cycle, cycle * P)
+    assert mine.check(8 * P, WHOLE) == "LOC"
+    mine.adopt("LOC", fallback=True)
+    for cycle in range(9, 13):
+        mine.released(cycle, cycle * P)
+        mine.completed(cycle, cycle * P)
+    mine.actuated("see", 6)  # of the placement before
+    assert not mine.carries
+    # Its first origin is cycle 10; HYB is next, as LOC has not carried the chain.
+    assert mine.due_ns == 18 * P
+    assert mine.check(18 * P, WHOLE) == "HYB"
+    mine.actuated("see", 10)
+    assert mine.carries
+
+
+@pytest.mark.parametrize("every", [1, 3])
+@pytest.mark.parametrize("g", [2, 4])
+@pytest.mark.parametrize("m", [1, 3])
+def test_f_plus_1_times_g_plus_m_origins_at_most_without_an_actuation(
+    m: int, g: int, every: int
+) -> None:
+    names = ["F0", "F1", "F2"]
+    mine = chained(*names, every=every, patience=(m + g - 1) * every)
+    whole = dict.fromkeys([*names, "SO"], True)
+    lost = 0
+    for cycle in range(50, 50 + 4 * (m + g) * every):
+        now = cycle * P
+        if to := mine.check(now, whole):
+            mine.adopt(to, fallback=True)
+        if mine.placement == "F2" and cycle % every == 0:
+            break
+        mine.released(cycle, now)
+        mine.completed(cycle, now)
+        lost += cycle % every == 0
+    assert mine.placement == "F2"
+    assert 3 * (m + g - 1) <= lost <= 4 * (g + m)

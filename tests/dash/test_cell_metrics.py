@@ -228,7 +228,7 @@ def test_promtool_finds_nothing_to_complain_of(cell: StandIn) -> None:
 
 def test_the_page_of_the_documentation_has_all_metrics(cell: StandIn) -> None:
     families = {family.name: family for family in CellMetrics(cell.observer).collect()}
-    text = (ROOT / "docs/howto/monitoring.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/reference/metrics.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| `(dwell_\w+)` \|.*\| (.*) \|$", text, re.MULTILINE))
     suffixes = {"counter": "_total", "info": "_info"}
     assert rows == {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -11,6 +12,7 @@ import pytest
 import dwell
 from dwell.dash.recorded_cell import RecordedCell, difference, same_realisation
 from dwell.errors import RunError
+from dwell.model import Weights
 from dwell.study.verdict import verdict_of
 from tests.cells.late_cycles import late_run, without_late_cycles
 from tests.dash.recorded import small_run
@@ -66,6 +68,23 @@ def test_a_state_is_what_was_known_then(cell: RecordedCell, run: dwell.Run) -> N
     assert cell.state(close_s - 0.001)["window"]["number"] == 19
     assert cell.state(0.0).get("window") is None
     json.dumps(state, allow_nan=False)
+
+
+def test_a_weighed_age_is_shown_as_seen_and_as_estimated(tmp_path: Path) -> None:
+    problem = dwell.load("examples/canonical.yaml")
+    objective = replace(
+        problem.objective,
+        weights=Weights(age=1.0),
+        targets=replace(problem.objective.targets, age_ms=80.0),
+    )
+    run = dwell.simulate(replace(problem, objective=objective), seed=1, windows=8)
+    run.save(tmp_path / "run")
+    cell = RecordedCell(tmp_path / "run")
+    state = cell.state(float(run.cycles["release_ns"][-1]) / 1e9)
+    window = run.windows.row(state["window"]["number"], named=True)
+    assert state["window"]["seen"]["age_ms"] == pytest.approx(window["seen_age_ms"], abs=1e-4)
+    assert state["candidates"]["LOC"]["age_ms"] > 0
+    assert cell.described()["weighs_age"] is True
 
 
 def test_the_age_is_that_of_the_newest_cycle_in_effect(cell: RecordedCell, run: dwell.Run) -> None:

@@ -15,6 +15,7 @@ from dwell.estimators import Evidence
 from dwell.estimators.measured import Message, Meter, Part, Site, groups, parts_of, sending_ns
 from dwell.model import Bursts, Constant, Execution, Flow, Link, Node, Problem, Task
 from tests.cells.generated import make_problem
+from tests.cells.once import with_windows
 from tests.estimators.windows import MS, Row, window
 
 ONE = Execution(Constant(1.0))
@@ -322,3 +323,24 @@ def test_groups_are_every_code_with_its_rows(codes: Sequence[int]) -> None:
     assert found == {
         code: [i for i, other in enumerate(codes) if other == code] for code in sorted(set(codes))
     }
+
+
+# -------------------------------------------------------------------------------- several rates
+
+
+@pytest.mark.parametrize(("age_ms", "is_lost"), [(250.0, False), (1999.0, False), (2001.0, True)])
+def test_a_message_of_a_slow_task_is_lost_after_two_of_its_intervals(
+    age_ms: float, is_lost: bool
+) -> None:
+    problem = chain()
+    tasks = {name: replace(task, every=None) for name, task in problem.pipeline.tasks.items()}
+    tasks["A"] = replace(tasks["A"], every=10)
+    pipeline = replace(problem.pipeline, tasks=tasks)
+    slow = replace(with_windows(problem, 100), pipeline=pipeline)
+    begin_ms = CLOSE_MS * 10 - age_ms - 1.0
+    row: Row = [begin_ms, None, None, None], [begin_ms + 1.0, None, None, None], [None] * 3
+    evidence = window([row], placement=[1], close_ms=CLOSE_MS * 10)
+    for measure in (Meter(slow).times, Meter(slow).demands):
+        found = measure(evidence)
+        assert found[Site("A", "R")].tolist()[:1] in ([1.0], [])
+        assert [*found.get(UP, [])] == ([math.inf] if is_lost else [])

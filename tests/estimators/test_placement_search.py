@@ -6,11 +6,13 @@ import itertools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from random import Random
 from typing import Any
 
 import pytest
 
 import dwell
+from dwell.cellfile.cell import from_document
 from dwell.cost import cost
 from dwell.errors import PlacementError, ProblemError, SimulationError
 from dwell.estimators.any_placement import AnyPlacement
@@ -19,6 +21,7 @@ from dwell.estimators.placement_search import Ranked, rank, rank_until_apart
 from dwell.model import Placement, Problem
 from tests.cells.heft import heft_graph
 from tests.cells.random_dags import random_dag
+from tests.cells.rated import inner_loop, with_rates
 
 CYCLES = 500
 
@@ -64,8 +67,27 @@ def small_dags(count: int) -> Iterator[tuple[int, Problem]]:
     return itertools.islice(small, count)
 
 
+def rated_dags(count: int) -> Iterator[tuple[int, Problem]]:
+    """Yield small cells with several rates and sampled flows, half of them with idle cycles."""
+    for number, (seed, problem) in enumerate(small_dags(count)):
+        pipeline = with_rates(problem, rng := Random(seed), idle=number % 2 == 0).pipeline
+        deadline_ms = pipeline.period_ms * (1.0, 2.5)[number // 2 % 2]
+        tasks = {
+            name: replace(task, depth=rng.choice([0, 0, 1]))
+            for name, task in pipeline.tasks.items()
+        }
+        yield (
+            seed,
+            replace(problem, pipeline=replace(pipeline, tasks=tasks, deadline_ms=deadline_ms)),
+        )
+
+
 @pytest.mark.parametrize(
-    ("seed", "problem"), [pytest.param(*one, id=str(one[0])) for one in small_dags(20)]
+    ("seed", "problem"),
+    [
+        *(pytest.param(*one, id=str(one[0])) for one in small_dags(20)),
+        *(pytest.param(*one, id=f"rates-{one[0]}") for one in rated_dags(12)),
+    ],
 )
 def test_the_search_finds_what_simulating_all_placements_finds(seed: int, problem: Problem) -> None:
     everything = brute_force(problem, seed)
@@ -207,6 +229,16 @@ def test_more_cycles_tell_placements_apart_or_end_in_a_tie() -> None:
 def test_numbers_out_of_range_are_refused(given: dict[str, Any], words: str) -> None:
     with pytest.raises(SimulationError, match=words):
         dwell.search(heft_graph(), **given)
+
+
+def test_a_search_needs_a_run_of_each_sink() -> None:
+    cell = inner_loop(window_cycles=60)
+    cell["flows"][2]["sampled"] = False
+    cell["tasks"]["control"]["every"] = 10
+    problem = from_document(cell)
+    assert dwell.search(problem, cycles=10)
+    with pytest.raises(SimulationError, match="cycles is 9; it must be at least 10"):
+        dwell.search(problem, cycles=9)
 
 
 def test_an_unknown_scenario_is_refused() -> None:

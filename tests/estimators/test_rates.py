@@ -7,10 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-import dwell
 from dwell import simulate
 from dwell.cellfile.cell import from_document
-from dwell.errors import SimulationError
 from dwell.estimators import warnings_of
 from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.measured import Site
@@ -20,60 +18,12 @@ from dwell.kernels.arrays import CellArrays
 from dwell.kernels.random_draws import draw
 from dwell.model import Problem
 from dwell.study.summary import summarise
+from tests.cells.rated import idle_cell, inner_loop
 
 SEEDS = range(6)
 
 
-def drawn(mean_ms: float) -> dict[str, Any]:
-    return {"lognormal": {"mean": mean_ms, "cv": 0.3}}
-
-
-def document(**changes: Any) -> dict[str, Any]:
-    """A control loop at 100 Hz that samples the detections of a camera at 10 Hz."""
-    on = {"R": {"exec_ms": drawn(2)}}
-    return {
-        "dwell": 1,
-        "name": "inner-loop",
-        "period_ms": 10,
-        "deadline_ms": 7,
-        "window_cycles": 40,
-        "nodes": {"R": {"tier": "robot", "cores": 2}, "E": {"tier": "edge", "cores": 4}},
-        "links": [{"from": "R", "to": "E", "both_ways": True, "delay_ms": drawn(2)}],
-        "tasks": {
-            "camera": {"on": on, "every": 10, "offset_ms": 1},
-            "imu": {"on": on},
-            "detect": {"on": {"R": {"exec_ms": drawn(60)}, "E": {"exec_ms": drawn(30)}}},
-            "control": {"on": {"R": {"exec_ms": drawn(3)}, "E": {"exec_ms": drawn(1)}}},
-        },
-        "flows": [
-            {"from": "camera", "to": "detect", "bytes": 1000},
-            {"from": "imu", "to": "control"},
-            {"from": "detect", "to": "control", "sampled": True},
-        ],
-        "candidates": {
-            "LOC": {"detect": "R", "control": "R"},
-            "SO": {"detect": "E", "control": "R"},
-            "ALL": {"detect": "E", "control": "E"},
-        },
-        "objective": {
-            "weights": {"latency": 1, "violations": 1, "robot": 1, "edge": 1, "switching": 1},
-            "targets": {"latency_ms": 5, "robot": 0.5, "edge": 0.5},
-        },
-    } | changes
-
-
-def idle_cell() -> Problem:
-    """The same loop, whose control waits for the detections: nine cycles in ten are idle."""
-    cell = document(deadline_ms=10, period_ms=20, window_cycles=60)
-    cell["flows"][2]["sampled"] = False
-    cell["tasks"]["control"]["every"] = 10
-    for name in ("detect", "camera"):
-        for on in cell["tasks"][name]["on"].values():
-            on["exec_ms"] = drawn(1)
-    return from_document(cell)
-
-
-@pytest.mark.parametrize("problem", [from_document(document()), idle_cell()], ids=["all", "idle"])
+@pytest.mark.parametrize("problem", [from_document(inner_loop()), idle_cell()], ids=["all", "idle"])
 def test_a_price_is_the_mean_of_runs_that_stay(problem: Problem) -> None:
     for name, price in prices_of(problem).items():
         runs = [
@@ -87,13 +37,13 @@ def test_a_price_is_the_mean_of_runs_that_stay(problem: Problem) -> None:
 
 
 def test_own_work_counts_each_run() -> None:
-    own = prices_of(from_document(document()))["LOC"].own
+    own = prices_of(from_document(inner_loop()))["LOC"].own
     # camera 2 ms and detect 60 ms in ten cycles, imu 2 ms and control 3 ms in each, on two cores.
     assert own["R"] == pytest.approx((0.2 + 6 + 2 + 3) / 20, rel=0.02)
 
 
 def test_a_run_of_a_slow_task_takes_the_measured_values_in_turn() -> None:
-    problem = from_document(document())
+    problem = from_document(inner_loop())
     real = draw(problem, seed=1, windows=2)
     site = Site("detect", "E")
     player = CandidatePlayer([(problem, real)], measures=True, log_jobs=True)
@@ -103,7 +53,7 @@ def test_a_run_of_a_slow_task_takes_the_measured_values_in_turn() -> None:
 
 
 def test_what_is_not_due_is_no_loss() -> None:
-    problem = from_document(document())
+    problem = from_document(inner_loop())
     prices = prices_of(problem)
     run = simulate(problem, policy="dtp", estimator="corrected", seed=1, windows=60)
     for name, price in prices.items():
@@ -113,7 +63,7 @@ def test_what_is_not_due_is_no_loss() -> None:
 
 def test_a_sampled_message_that_no_shadow_gets_is_no_loss() -> None:
     """With control alone on E, its shadows do not get the detections, which both share."""
-    cell = document(controller={"shadow_fraction": 0.1})
+    cell = inner_loop(controller={"shadow_fraction": 0.1})
     cell["candidates"] = {"LOC": {"detect": "R", "control": "R"}}
     cell["candidates"]["FAR"] = {"detect": "R", "control": "E"}
     run = simulate(from_document(cell), policy="LOC", estimator="corrected", seed=1, windows=30)
@@ -122,14 +72,9 @@ def test_a_sampled_message_that_no_shadow_gets_is_no_loss() -> None:
 
 def test_the_controller_leaves_a_slow_node() -> None:
     slow = [{"node": "E", "at_s": 4, "stress_threads": 60}]
-    problem = from_document(document(scenarios={"slow": slow}, controller={"initial": "ALL"}))
+    problem = from_document(inner_loop(scenarios={"slow": slow}, controller={"initial": "ALL"}))
     run = simulate(problem, scenario="slow", policy="dtp", seed=1, windows=40)
     assert run.windows["placement"].to_list()[-1] != "ALL"
-
-
-def test_the_search_of_placements_refuses_rates() -> None:
-    with pytest.raises(SimulationError, match="every"):
-        dwell.search(from_document(document()), cycles=40)
 
 
 def warned(document: dict[str, Any]) -> list[str]:
@@ -137,7 +82,7 @@ def warned(document: dict[str, Any]) -> list[str]:
 
 
 def test_a_time_between_decisions_without_a_run_of_a_sink_is_a_warning() -> None:
-    cell = document(controller={"decide_cycles": 5})
+    cell = inner_loop(controller={"decide_cycles": 5})
     assert "controller.decide_cycles" not in warned(cell)
     cell["flows"][2]["sampled"] = False
     cell["tasks"]["control"]["every"] = 10
@@ -145,7 +90,7 @@ def test_a_time_between_decisions_without_a_run_of_a_sink_is_a_warning() -> None
 
 
 def test_an_offset_beyond_the_deadline_is_a_warning_on_the_way_to_a_sink_only() -> None:
-    cell = document()
+    cell = inner_loop()
     cell["tasks"]["imu"] = {**cell["tasks"]["imu"], "offset_ms": 8}
     cell["tasks"]["camera"]["offset_ms"] = 9
     paths = warned(cell)
@@ -154,7 +99,7 @@ def test_an_offset_beyond_the_deadline_is_a_warning_on_the_way_to_a_sink_only() 
 
 
 def test_a_slow_task_needs_its_share_of_a_core() -> None:
-    cell = document(nodes={"R": {"tier": "robot"}, "E": {"tier": "edge"}})
+    cell = inner_loop(nodes={"R": {"tier": "robot"}, "E": {"tier": "edge"}})
     cell["tasks"]["detect"]["on"]["R"]["exec_ms"] = 40
     assert "candidates.LOC" not in warned(cell)
     cell["tasks"]["camera"]["every"] = 5

@@ -49,6 +49,12 @@ def test_a_duration_is_known_or_lost_or_unknown(
     np.testing.assert_array_equal(spans_ms(begun, ended, round(LIMIT_MS * MS)), [[span_ms]])
 
 
+def test_columns_may_have_limits_of_their_own() -> None:
+    begun, ended = np.array([[0, 0]]) * MS, np.array([[-1, -1]])
+    limits = np.array([-10, 10]) * MS
+    np.testing.assert_array_equal(spans_ms(begun, ended, limits), [[math.nan, math.inf]])
+
+
 def test_every_column_is_for_itself() -> None:
     begun = np.array([[0, -1, 10], [0, 60, 70]]) * MS
     ended = np.array([[3, -1, -1], [4, 61, -1]]) * MS
@@ -60,6 +66,28 @@ def test_every_column_is_for_itself() -> None:
 @pytest.mark.parametrize(("cycles", "periods"), [(1, 0), (2, 1), (3, 2), (100, 2)])
 def test_the_patience_is_never_longer_than_the_window(cycles: int, periods: int) -> None:
     assert patience_ns(cell(cycles, 33.3)) == round(periods * 33.3 * MS)
+
+
+@pytest.mark.parametrize(
+    ("decides", "periods"),
+    [
+        # Twice the interval of ten periods.
+        (100, 20),
+        (30, 20),
+        # The oldest run of a decision is at least 25 - 9 periods old.
+        (25, 15),
+        (20, 10),
+        # A decision sees one run, or none.
+        (19, 9),
+        (10, 9),
+        (5, 4),
+        (1, 0),
+    ],
+)
+def test_the_patience_follows_the_rate(decides: int, periods: int) -> None:
+    problem = cell(100, 10.0)
+    controller = replace(problem.controller, decide_cycles=decides)
+    assert patience_ns(replace(problem, controller=controller), 10) == periods * 10 * MS
 
 
 @pytest.mark.parametrize(("cycles", "periods"), [(1, 3), (2, 4), (3, 5), (100, 5)])

@@ -53,6 +53,8 @@ KINDS: tuple[type[msgspec.Struct], ...] = tuple(
 )
 STAMP = messages.Stamp(1, 5, 1, "LOC", 0)
 HOP = messages.Hop("sensing", "R1", 1, 2, 3, (("stamper", 1),))
+ORIGIN = messages.Origin("sensing", 5, 0)
+RATED_HOP = messages.RatedHop(**msgspec.structs.asdict(HOP), origins=(ORIGIN,))
 
 
 class Plan(msgspec.Struct):
@@ -309,6 +311,8 @@ def wholes() -> list[msgspec.Struct]:
         *(STAMP, messages.Stamped(**msgspec.structs.asdict(STAMP), intervals=((4, 9),)), HOP),
         Header(STAMP, "sensing", "R1", "bytes", (HOP,)),
         Completion(STAMP, "control", 9, "actuated", (HOP,), "R2"),
+        *(ORIGIN, RATED_HOP, messages.RatedHeader(STAMP, "sensing", "R1", "bytes", (RATED_HOP,))),
+        messages.RatedCompletion(STAMP, "control", 9, "sampled", (RATED_HOP,), "R2"),
         messages.Heard("stamper@R1", "R1", 1, 2),
         Beat("agent@E", "E", 1, 5, True, (messages.Heard("stamper@R1", "R1", 1, 2),), cell="x"),
         messages.Beats((Beat("agent@E", "E", 1, 5, True), Beat("planning@E", "E", 1, 4, True))),

@@ -263,7 +263,10 @@ def replay(
 
 
 def settle(windows: LiveWindows, controller: Controller, window: ClosedWindow) -> None:
-    """Have a closed window decided on."""
+    """Have a closed window decided on; without a due sink in it the decision is missed."""
+    if not len(window.latency_ns):
+        controller.miss()
+        return
     proposal = controller.propose(window)
     assert windows.looked is not None
     windows.looked.seen = proposal.seen

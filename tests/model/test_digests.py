@@ -105,9 +105,11 @@ flows:
 chains: {see-act: {from: see, to: act, max_age_ms: 90}}
 candidates: {LOC: {think: R}, FAR: {think: E}}
 objective:
-  weights: {latency: 1.5, violations: 2, robot: 0.6, edge: 0.4, switching: 0.3, cloud: 0.2}
-  targets: {latency_ms: 80, robot: 0.6, edge: 0.5, cloud: 0.4}
-  caps: {latency_ms: 95, utilisation: 0.9}
+  weights:
+    {latency: 1.5, violations: 2, robot: 0.6, edge: 0.4, switching: 0.3, cloud: 0.2, age: 0.1}
+  targets: {latency_ms: 80, robot: 0.6, edge: 0.5, cloud: 0.4, age_ms: 70}
+  caps: {latency_ms: 95, utilisation: 0.9, misses: {m: 2, k: 20}}
+  latency: see-act
   tiers: {R: robot}
   accelerators: true
 scenarios:

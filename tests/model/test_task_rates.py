@@ -7,10 +7,8 @@ from typing import Any
 import pytest
 
 from dwell.cellfile.cell import from_document
-from dwell.errors import LiveError, ProblemError
-from dwell.live.wire.wiring import wire
+from dwell.errors import ProblemError
 from dwell.model import Constant, Execution, Flow, Pipeline, Problem, Task
-from dwell.model.fleet import fleet_faults
 from dwell.model.task_rates import rates_of
 
 EXECUTION = Execution(Constant(1.0))
@@ -179,23 +177,9 @@ def test_frames_release_each_cycle() -> None:
     assert "every" in message
 
 
-def test_the_guard_needs_a_sink_in_each_cycle() -> None:
+def test_fallbacks_fit_a_cell_with_idle_cycles() -> None:
     document = cell(controller={"fallbacks": ["LOC"]})
-    assert made(document).controller.fallbacks == ("LOC",)
     document["flows"][2]["sampled"] = False
-    path, message = fault_of(document, control={"every": 10})
-    assert path == "controller.fallbacks"
-    assert "no sink" in message
-
-
-def test_live_cells_refuse_rates() -> None:
-    with pytest.raises(LiveError) as caught:
-        wire(made(cell(live={"hosts": {"R": {"address": "10.0.0.1", "port": 7000}}})))
-    for words in ("tasks.camera.every", "flows[2].sampled"):
-        assert words in str(caught.value)
-
-
-def test_fleets_refuse_rates() -> None:
-    (fault,) = fleet_faults([(2, made(cell()))], (), "sync")
-    assert fault.path == "cells[0].cell"
-    assert "every" in fault.message
+    problem = made(document, control={"every": 10})
+    assert problem.pipeline.has_idle_cycles
+    assert problem.controller.fallbacks == ("LOC",)

@@ -1,8 +1,11 @@
-"""Ages of a chain, from the record of a run; by the section "Chains" of the page."""
+"""Ages of a chain or of cycles, from the record of a run; by the section "Chains" of the page."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 from dwell.model import Problem
 from tests.reference.rates import Rates
@@ -11,23 +14,16 @@ from tests.reference.simulator import Result
 
 @dataclass(frozen=True)
 class Actuation:
-    """A completion of a chain's last task: its cycle, instant, and age."""
+    """A completion of a chain's last task, or of a cycle: its cycle, instant, and age."""
 
     cycle: int
     at_ns: int
     age_ns: int
 
-
-def descent(problem: Problem, result: Result, start: str, task: str, cycle: int) -> set[int]:
-    """Return the cycles of `start` from which a job descends."""
-    if task == start:
-        return {cycle}
-    rates, found = Rates(problem.pipeline), set[int]()
-    for flow in rates.waited_inputs(task):
-        found |= descent(problem, result, start, flow.source, cycle)
-    for source, taken in result.jobs[cycle, task].taken.items():
-        found |= descent(problem, result, start, source, taken)
-    return found
+    @property
+    def born_ns(self) -> int:
+        """Release of its origin."""
+        return self.at_ns - self.age_ns
 
 
 def actuations(
@@ -39,9 +35,61 @@ def actuations(
         for (cycle, task), job in result.jobs.items()
         if task == end and job.outcome == "done" and job.end_ns is not None
     )
+    rates = Rates(problem.pipeline)
     found: list[Actuation] = []
     origin = 0
+
+    def taken(cycle: int, task: str) -> Mapping[str, int]:
+        return result.jobs[cycle, task].taken
+
     for at_ns, cycle in done:
-        origin = min(descent(problem, result, start, end, cycle), default=origin)
+        origin = min(rates.descent(taken, start, end, cycle), default=origin)
         found.append(Actuation(cycle, at_ns, at_ns - release_ns[origin]))
     return found
+
+
+def completions(result: Result, release_ns: Sequence[int]) -> list[Actuation]:
+    """Return the completions of cycles, by instant, then by cycle."""
+    found = [
+        Actuation(k, release_ns[k] + cycle.latency_ns, cycle.latency_ns)
+        for k, cycle in enumerate(result.cycles)
+        if cycle.latency_ns is not None
+    ]
+    return sorted(found, key=lambda one: (one.at_ns, one.cycle))
+
+
+def age_l95_ms(known: Sequence[Actuation], first: int, count: int, close_ns: int) -> float:
+    """Return L95 of the ages of some cycles' actuations up to the close; infinite without any."""
+    cycles = range(first, first + count)
+    ages = sorted(one.age_ns for one in known if one.cycle in cycles and one.at_ns <= close_ns)
+    return ages[math.ceil(0.95 * len(ages)) - 1] / 1e6 if ages else math.inf
+
+
+def mean_age_ms(
+    known: Sequence[Actuation], begin_ns: int, close_ns: int, run_begin_ns: int, most_ms: float
+) -> float:
+    """Return the mean over time of the age in effect, each age at most `most_ms`.
+
+    A command that completes after the command of a newer cycle has no effect.
+    """
+    newest, born_ns, at_ns, area = -1, run_begin_ns, begin_ns, Fraction(0)
+    for one in known:
+        if one.at_ns > close_ns:
+            break
+        if one.cycle < newest:
+            continue
+        if one.at_ns > at_ns:
+            area += grown(at_ns - born_ns, one.at_ns - born_ns, Fraction(most_ms * 1e6))
+            at_ns = one.at_ns
+        newest, born_ns = one.cycle, one.born_ns
+    area += grown(at_ns - born_ns, close_ns - born_ns, Fraction(most_ms * 1e6))
+    return float(area / (close_ns - begin_ns) / 10**6)
+
+
+def grown(young: int, old: int, most: Fraction) -> Fraction:
+    """Return the area under an age that grows, or under `most` where it is older."""
+    if old <= most:
+        return Fraction((young + old) * (old - young), 2)
+    if young >= most:
+        return most * (old - young)
+    return (young + most) * (most - young) / 2 + most * (old - most)

@@ -7,7 +7,7 @@ them, and works out from them whether it fires, and where the cell goes.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from dwell.model import Problem
@@ -23,14 +23,36 @@ NEVER = 2**63
 class Stay:
     """A time under one placement, from its first cycle on.
 
-    `by_guard`: the guard moved the cell there. Cycles before `watched` are not waited for.
+    `by_guard`: the guard moved the cell there. Cycles before `watched` are not waited for, nor
+    those before `rest_end` once the placement has carried what is waited for.
     """
 
     placement: str
     first: int
     by_guard: bool
     watched: int
+    rest_end: int = 0
     rested: bool = False
+
+
+@dataclass(eq=False)
+class Wait:
+    """What the guard waits for: cycles, or the origins of a chain.
+
+    `released` are those that count; `newest` is the highest that was heard of.
+    """
+
+    patience: int
+    is_chain: bool = False
+    every: int = 1
+    released: list[int] = field(default_factory=list)
+    newest: int = -1
+
+    def oldest(self, first: int) -> int | None:
+        """Return the cycle whose age counts, of those from `first` on."""
+        since = max(first, self.newest if self.is_chain else self.newest + 1)
+        rest = self.released[bisect_left(self.released, since) :]
+        return rest[0] if rest else None
 
 
 @dataclass(eq=False)
@@ -42,19 +64,22 @@ class Through:
 
 
 class Guard:
-    """Whether the cell moves by itself, and where to; its `patience` is max(D, P) + (g - 1) P."""
+    """Whether the cell moves by itself, and where to.
 
-    def __init__(self, problem: Problem, patience: int) -> None:
+    `waits` has its patience with cycles, max(D, P) + (g - 1) P, then those with chains; `longest`
+    is the longest patience.
+    """
+
+    def __init__(self, problem: Problem, waits: Sequence[Wait]) -> None:
         settings = problem.controller
-        self.patience = patience
+        self.cycles, *chains = waits
+        self.waits, self.chains = list(waits), chains
+        self.longest = max(wait.patience for wait in waits)
         self.fallbacks = settings.fallbacks
         self.probe_cycles = settings.probe_cycles
         self.in_a_row = settings.guard_cycles + 1
         self.stay = Stay(problem.initial, 0, by_guard=False, watched=0)
         self.released: list[int] = []
-        # Cycles in which a sink is due; it waits for these alone.
-        self.due: list[int] = []
-        self.newest = -1
         # First cycle since its own node was down.
         self.restarted = 0
         self.rests = 0
@@ -82,27 +107,37 @@ class Guard:
         """
         if active != self.stay.placement:
             if self.stay.by_guard:
-                carried = self.newest >= self.stay.first
+                carried = self.carries
                 self.carrier = self.stay.placement if carried else None
                 self.returned = cycle
             self.stay = Stay(active, cycle, by_guard=False, watched=cycle)
             self.rests = 0
             self.begin_anew()
         self.released.append(now)
+        for chain in self.chains:
+            if cycle % chain.every == 0:
+                chain.released.append(cycle)
         if due:
-            self.due.append(cycle)
+            self.cycles.released.append(cycle)
             self.through[active].released[cycle] = now
         if other is not None:
             self.through[other].released[cycle] = now
 
-    def hear(self, cycle: int) -> None:
-        """Hear that a cycle has completed."""
-        self.newest = max(self.newest, cycle)
-        if cycle < self.stay.first:
+    def hear(self, cycle: int, chain: int | None = None) -> None:
+        """Hear that a cycle has completed, or that a chain has actuated from it."""
+        wait = self.cycles if chain is None else self.chains[chain]
+        wait.newest = max(wait.newest, cycle)
+        if not self.carries:
             return
         self.begin_anew()
         if self.stay.by_guard and not self.stay.rested:
-            self.rest(self.stay.first)
+            self.stay.rested = True
+            self.rests += 1
+
+    @property
+    def carries(self) -> bool:
+        """Whether all that is waited for has been heard of since the placement began."""
+        return all(wait.newest >= self.stay.first for wait in self.waits)
 
     def hear_through(self, candidate: str, cycle: int) -> None:
         """Hear that a cycle, or a shadow, has completed through a candidate."""
@@ -117,19 +152,24 @@ class Guard:
         """Forget what was tried, as a cycle has completed, or an order takes effect."""
         self.tried, self.failed, self.spent = [], [], False
 
-    def rest(self, first: int) -> None:
-        """Rest: do not wait for so many cycles from the `first` on."""
-        self.stay.watched = first + self.probe_cycles * 2 ** min(self.rests, MOST_DOUBLINGS)
-        self.stay.rested = True
-        self.rests += 1
+    @property
+    def rest(self) -> int:
+        """Length of the next rest."""
+        length: int = self.probe_cycles * 2 ** min(self.rests, MOST_DOUBLINGS)
+        return length
 
     # ---------------------------------------------------------------------------- whether it fires
 
     def fires(self, now: int) -> bool:
-        """Whether the cycle that it waits for is as old as the patience."""
-        first = max(self.newest + 1, self.stay.watched, self.restarted)
-        waited = self.due[bisect_left(self.due, first) :][:1]
-        return any(self.released[cycle] + self.patience <= now for cycle in waited)
+        """Whether a cycle or an origin that it waits for is as old as its patience."""
+        for wait in self.waits:
+            first = max(self.stay.watched, self.restarted)
+            if wait.newest >= self.stay.first:
+                first = max(first, self.stay.rest_end)
+            oldest = wait.oldest(first)
+            if oldest is not None and self.released[oldest] + wait.patience <= now:
+                return True
+        return False
 
     def failing(self, candidate: str, now: int) -> bool:
         """Whether the last g + 1 cycles or shadows through a candidate have failed."""
@@ -137,7 +177,7 @@ class Guard:
         old = [
             at
             for cycle, at in through.released.items()
-            if cycle > through.newest and at + self.patience <= now
+            if cycle > through.newest and at + self.longest <= now
         ]
         row = old[-self.in_a_row :]
         return len(row) == self.in_a_row and row[0] >= now - EVIDENCE_NS
@@ -145,7 +185,8 @@ class Guard:
     def in_order(self) -> list[str]:
         """Return the fallbacks that may be tried, in their order."""
         first = []
-        if self.carrier is not None and self.newest < self.returned + self.probe_cycles:
+        newest = min(wait.newest for wait in self.waits)
+        if self.carrier is not None and newest < self.returned + self.probe_cycles:
             first = [self.carrier]
         others = [name for name in self.fallbacks if name not in self.failed]
         order = list(dict.fromkeys([*first, *others, *self.failed]))
@@ -163,7 +204,9 @@ class Guard:
             return name
         if self.tried and not self.spent:
             self.spent = True
-            self.rest(len(self.released))
+            self.stay.watched = len(self.released) + self.rest
+            self.stay.rested = True
+            self.rests += 1
         return None
 
     def move(self, fallback: str) -> None:
@@ -174,7 +217,7 @@ class Guard:
         self.tried.append(fallback)
         self.carrier = None
         first = len(self.released)
-        self.stay = Stay(fallback, first, by_guard=True, watched=first)
+        self.stay = Stay(fallback, first, True, watched=first, rest_end=first + self.rest)
         self.spent = False
 
 

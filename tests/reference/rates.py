@@ -5,6 +5,8 @@ Shares no code with `dwell.model` beyond the keys of tasks and flows.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 from dwell.model import Flow, Pipeline, Placement
 
 
@@ -53,6 +55,30 @@ class Rates:
     def carries(self, flow: Flow, cycle: int) -> bool:
         """Whether a flow has a message of a cycle."""
         return cycle % self.of_flow(flow) == 0
+
+    def descent(
+        self, taken: Callable[[int, str], Mapping[str, int]], start: str, task: str, cycle: int
+    ) -> set[int]:
+        """Return the cycles of `start` from which a job descends.
+
+        `taken` returns the cycles of the values that a job got, by their sources.
+        """
+        if task == start:
+            return {cycle}
+        found = set[int]()
+        for flow in self.waited_inputs(task):
+            found |= self.descent(taken, start, flow.source, cycle)
+        for source, value in taken(cycle, task).items():
+            found |= self.descent(taken, start, source, value)
+        return found
+
+    def on_ways(self, start: str, end: str) -> list[str]:
+        """Return the tasks on the ways by flows of either kind from one task to another."""
+        if start == end:
+            return [end]
+        behind = [self.on_ways(flow.target, end) for flow in self.pipeline.outputs(start)]
+        found = [task for tasks in behind for task in tasks]
+        return [start, *found] if found else []
 
     def apart(self, active: Placement, other: Placement) -> set[str]:
         """Return the tasks that run on another node under `other`, or behind such a task."""

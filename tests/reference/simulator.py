@@ -21,7 +21,7 @@ import simpy
 
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import Execution, Flow, Node, Placement, Problem, Quota, Task
-from tests.reference.guard import NEVER, Guard, Proof
+from tests.reference.guard import NEVER, Guard, Proof, Wait
 from tests.reference.rates import Rates
 
 #: Of the changes of one instant, the place of what quotas do then.
@@ -805,9 +805,20 @@ class Simulation:
         self.moving = False
 
         period, deadline = map(nanoseconds, (self.pipeline.period_ms, self.pipeline.deadline_ms))
-        self.patience = max(deadline, period) + (self.settings.guard_cycles - 1) * period
-        self.guard = Guard(problem, self.patience) if guarded else None
-        self.proof = Proof(problem, self.patience)
+        more = self.settings.guard_cycles - 1
+        waits = [Wait(max(deadline, period) + more * period)]
+        # Chains whose age the guard bounds.
+        self.chains = [
+            chain for chain in self.pipeline.chains.values() if math.isfinite(chain.max_age_ms)
+        ]
+        for chain in self.chains:
+            ways = self.rates.on_ways(chain.source, chain.target)
+            slowest = max(self.rates.of[task] for task in ways)
+            patience = nanoseconds(chain.max_age_ms) + more * slowest * period
+            waits.append(Wait(patience, is_chain=True, every=self.rates.of[chain.source]))
+        self.patiences = [wait.patience for wait in waits]
+        self.guard = Guard(problem, waits) if guarded else None
+        self.proof = Proof(problem, max(self.patiences))
         self.decisions: list[Decision] = []
         # Candidates that cycles are probes of, from which on.
         self.wishes: list[tuple[int, str | None]] = []
@@ -1272,7 +1283,8 @@ class Simulation:
             at + nanoseconds(task.start_ms) for at in back for task in self.pipeline.tasks.values()
         }
         links = {segment.at_ns for segments in self.segments.values() for segment in segments}
-        return {release + self.patience for release in self.release} | back | started | links
+        old = {release + patience for release in self.release for patience in self.patiences}
+        return old | back | started | links
 
     def node_down_since(self, node: str, start: int = 0) -> int | None:
         """Since when a node is down; with a `start`, a worker on it that takes as long to be ready.
@@ -1344,6 +1356,28 @@ class Simulation:
         self.heard_of.add((cell, cycle))
         back = way_back(self.problem, self.placed[cell, cycle])
         self.at(self.now + back, ARRIVAL, cycle, -1, lambda: self.heard(cell, cycle), cell=cell)
+
+    def hear_actuation(self, job: Job) -> None:
+        """Let the guard hear of an actuation of a chain, after the way back."""
+
+        def taken(cycle: int, task: str) -> Mapping[str, int]:
+            return self.jobs[ITSELF, cycle, task].taken
+
+        back = way_from(self.problem, [job.node])
+        for number, chain in enumerate(self.chains):
+            if chain.target != job.task.name:
+                continue
+            known = self.rates.descent(taken, chain.source, chain.target, job.cycle)
+            for origin in [min(known)] if known else []:
+                act = self.actuated(number, origin)
+                self.at(self.now + back, ARRIVAL, job.cycle, -1, act)
+
+    def actuated(self, chain: int, origin: int) -> Callable[[], None]:
+        def heard() -> None:
+            if self.guard is not None:
+                self.guard.hear(origin, chain)
+
+        return heard
 
     def heard(self, cell: int, cycle: int) -> None:
         """The guard hears of the completion of a cycle or a probe."""
@@ -1680,6 +1714,8 @@ class Simulation:
         if job.cell == ITSELF and job.task.name in self.rates.sinks:
             self.hear_back(ITSELF, job.cycle)
             self.hear_back(SHADOW, job.cycle)
+        if job.cell == ITSELF and self.guard is not None:
+            self.hear_actuation(job)
 
     def send_output(self, cell: int, flow: Flow, job: Job) -> None:
         """Hand an output over, or send it, to where a cell has its target."""
@@ -1981,15 +2017,20 @@ class Simulation:
 
 def way_back(problem: Problem, placement: Placement) -> int:
     """Return the least sum of mean delays from the farthest sink's node to the stamper's."""
+    tasks = problem.pipeline.tasks
+    sinks = [placement[task] for task in tasks if not problem.pipeline.outputs(task)]
+    return way_from(problem, sinks)
+
+
+def way_from(problem: Problem, places: Sequence[str]) -> int:
+    """Return the least sum of mean delays from the farthest of some nodes to the stamper's."""
     nodes, links = list(problem.fabric.nodes), problem.fabric.links
     ms = {(a, b): 0.0 if a == b else math.inf for a in nodes for b in nodes}
     for link in links.values():
         ms[link.source, link.target] = link.delay_ms.expectation
     for via, a, b in itertools.product(nodes, nodes, nodes):
         ms[a, b] = min(ms[a, b], ms[a, via] + ms[via, b])
-    tasks = problem.pipeline.tasks
-    sinks = [placement[task] for task in tasks if not problem.pipeline.outputs(task)]
-    ways = [ms[sink, problem.stamper_node] for sink in sinks]
+    ways = [ms[place, problem.stamper_node] for place in places]
     return nanoseconds(max(0.0 if math.isinf(way) else way for way in ways))
 
 

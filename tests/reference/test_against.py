@@ -50,7 +50,7 @@ from tests.cells.generated import (
     random_problem,
     random_stamps,
 )
-from tests.cells.rated import with_rates
+from tests.cells.rated import with_chains, with_rates
 from tests.kernels.parts import attempt_uniform as kernel_uniform
 from tests.reference import guard as reference_guard
 from tests.reference import simulator as reference_simulator
@@ -74,9 +74,9 @@ from tests.reference.simulator import (
 
 # Instant of a job or a message of a cycle in which there is none.
 NOT_DUE = -2
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "80"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "48"))
 # Of the problems that take longer: those with shadows, and those in which orders take time.
-LONGER = int(os.environ.get("DWELL_EXAMPLES", "40"))
+LONGER = int(os.environ.get("DWELL_EXAMPLES", "24"))
 #: One in so many is among the few; `make test-all` tries the others.
 ONE_IN = 4
 FAIR_TOLERANCE_NS = NEAR_NS
@@ -207,14 +207,13 @@ def make_case(
     orders: bool = False,
     in_order: bool = False,
     rates: bool = False,
-    idle: bool = True,
 ) -> Case:
     rng = Random(seed)
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
     if in_order:
         problem = with_order(problem, Random(seed), whole_ms=whole_ms)
     if rates:
-        problem = with_rates(problem, Random(f"{seed} rates"), idle=idle)
+        problem = with_rates(problem, Random(f"{seed} rates"))
     problem = with_deadline(problem, Random(f"{seed} deadline"), whole_ms=whole_ms)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
     names = tuple(random_stamps(rng, problem, windows))
@@ -301,7 +300,7 @@ def make_guarded(
 ) -> Case:
     """Make a case whose cell has a guard."""
     of = {"whole_ms": whole_ms, "orders": orders, "in_order": in_order, "rates": rates}
-    case = make_case(seed, schedulers, **of, idle=False)
+    case = make_case(seed, schedulers, **of)
     rng = Random(seed)
     names = list(case.problem.candidates)
     settings = replace(
@@ -312,6 +311,8 @@ def make_guarded(
         probe_cycles=rng.choice([1, 2, 2, 6]),
     )
     problem = replace(case.problem, controller=settings)
+    if rates:
+        problem = with_chains(problem, Random(f"{seed} chains"))
     windows = rng.randint(6, 14)
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     stamps = tuple(random_stamps(rng, problem, windows))

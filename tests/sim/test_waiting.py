@@ -6,7 +6,17 @@ from dataclasses import replace
 
 import pytest
 
-from dwell.model import Constant, Fabric, Link, Problem
+from dwell.model import (
+    Constant,
+    Execution,
+    Fabric,
+    Flow,
+    Link,
+    Pipeline,
+    Placement,
+    Problem,
+    Task,
+)
 from dwell.sim.fleet import waiting_in_fleet
 from dwell.sim.static_fleet import StaticFleet
 from dwell.sim.waiting import Waiting
@@ -59,3 +69,24 @@ def test_a_message_behind_others_waits_for_its_link() -> None:
 def test_nothing_is_waited_for_where_nothing_is_missed() -> None:
     fleet = fleet_of((one_job(), 3)).changed(policy="OFF", estimator="profile")
     assert waiting_in_fleet(fleet, seed=1, duration_ns=fleet.duration_ns(2)) == {}
+
+
+def test_idle_cycles_have_missed_nothing() -> None:
+    """The sink runs in every second cycle; in the others one sampled task waits for another."""
+    on = {"E": Execution(Constant(1.0))}
+    tasks = {
+        "sink": Task("sink", {"E": Execution(Constant(3.0))}, every=2),
+        "first": Task("first", on),
+        "second": Task("second", on),
+    }
+    flows = tuple(Flow(name, "sink", 0, sampled=True) for name in ("first", "second"))
+    cell = one_job()
+    pipeline = Pipeline(tasks, flows, cell.pipeline.period_ms, 2.0)
+    placed = {"OFF": Placement(dict.fromkeys(tasks, "E"))}
+    fleet = fleet_of((replace(cell, pipeline=pipeline, candidates=placed), 1))
+    length = {"seed": 1, "duration_ns": fleet.duration_ns(2)}
+    for waited in (
+        waiting_in_fleet(fleet.changed(policy="OFF", estimator="profile"), **length),
+        StaticFleet(**length).waiting(fleet.changed(policy="OFF")),
+    ):
+        assert ms(waited) == {("resource", "E"): pytest.approx(20 * (3 + 4))}

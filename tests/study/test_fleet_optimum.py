@@ -13,21 +13,19 @@ from tests.cells.random_fleets import every_phi, priced_cells, random_fleet
 LIMIT = 0.05
 
 
-@pytest.mark.parametrize("seed", range(10))
-def test_no_placements_are_better_than_the_plan_by_half_a_per_cent(seed: int) -> None:
+@pytest.mark.parametrize("seed", range(6))
+def test_no_placements_are_better_than_the_plan_nor_serve_more_cells(seed: int) -> None:
+    """Better by half a per cent; of those that serve most cells, too."""
     fleet = random_fleet(seed, most=5)
-    phi = every_phi(FleetLedger(priced_cells(fleet), fleet.shared))
+    # What cells serve is no part of Φ, so both plans are compared with the same plays.
+    ledger = FleetLedger(priced_cells(fleet), fleet.shared)
+    phi = every_phi(ledger)
     planned = tuple(plan_fleet(fleet).placements.values())
     assert phi[planned] <= 1.005 * min(phi.values())
 
-
-@pytest.mark.parametrize("seed", range(10))
-def test_no_placements_serve_more_cells_than_the_plan(seed: int) -> None:
-    fleet = replace(random_fleet(seed, most=5), objective="served", limit=LIMIT)
-    ledger = FleetLedger(priced_cells(fleet), fleet.shared, "served")
-    phi = every_phi(ledger)
     served = {placements: served_at(ledger, placements) for placements in phi}
-    planned = tuple(plan_fleet(fleet).placements.values())
+    serving = plan_fleet(replace(fleet, objective="served", limit=LIMIT))
+    planned = tuple(serving.placements.values())
     most = max(served.values())
     assert served[planned] == most
     assert phi[planned] <= 1.005 * min(phi[one] for one in phi if served[one] == most)

@@ -16,7 +16,6 @@ from dwell.study.quality import (
     EffectiveCommands,
     actuations,
     age_of_information,
-    misses_in,
     track,
 )
 
@@ -161,13 +160,6 @@ def test_the_percentile_of_ages_whose_sum_64_bits_do_not_hold() -> None:
     age = age_of_information(actuated, 0, end_ns)
     # At t the newest command in effect was released at 2 t / 3.
     assert age.p95_ms == pytest.approx(0.95 * end_ns / 3 / 1e6, rel=1e-3)
-
-
-@given(st.lists(st.booleans(), min_size=1, max_size=60), st.integers(1, 70))
-def test_misses_in_every_stretch(missed: list[bool], stretch: int) -> None:
-    (counts,) = misses_in(np.array(missed), [stretch])
-    starts = range(max(len(missed) - stretch, 0) + 1)
-    assert counts.tolist() == [sum(missed[at : at + stretch]) for at in starts]
 
 
 # -------------------------------------------------------------------------------- tracking

@@ -17,13 +17,13 @@ def cell_yaml(file: Path, measurements: Sequence[Measurement]) -> str:
     Parameters
     ----------
     file : Path
-        The profile; the cell takes it for relative to its own folder.
+        The profile, relative to the folder of the cell file.
     measurements : sequence of Measurement
 
     Returns
     -------
     str
-        YAML with ``tasks`` and ``links``, whichever there are.
+        YAML with ``tasks``, ``links`` or both.
     """
     return "\n".join([*_tasks(file, measurements), *_links(file, measurements)]) + "\n"
 

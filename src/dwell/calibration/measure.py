@@ -193,7 +193,7 @@ def _series(
         when = what.format(run)
         if not prepared:
             given, when = "the number of the run", f"inputs of {when}"
-        # Whether the call itself failed, such as for wrong arguments, or code inside it.
+        # True if the call itself failed, as with wrong arguments, and not code inside it.
         raised_here = error.__traceback__ is not None and error.__traceback__.tb_next is None
         wrong_call = isinstance(error, TypeError) and raised_here
         hint = f"; it is called with {given}" if wrong_call else ""

@@ -98,14 +98,14 @@ def require_free(path: Path, names: Collection[str]) -> None:
     Parameters
     ----------
     path : Path
-        Fine where it does not exist, or holds a profile of nothing else than `names`.
+        A new file, or a profile without other measurements than `names`.
     names : collection of str
         Names of the new profile's measurements.
 
     Raises
     ------
     ProfileError
-        If the file's name does not end in ``.parquet``, or something would be lost.
+        If its name does not end in ``.parquet``, it is no profile, or measurements would be lost.
     """
     if path.suffix.lower() != SUFFIX:
         raise ProfileError(f"{path}: a profile is a Parquet file; let its name end in {SUFFIX}")
@@ -162,7 +162,7 @@ def _require_one_length(rows: Mapping[str, int]) -> None:
 
 
 def read_profile(path: Path) -> tuple[Measurement, ...]:
-    """Read all that a profile holds.
+    """Read the measurements of a profile.
 
     Raises
     ------

@@ -243,7 +243,7 @@ def time_round_trips(
             return end - start
 
         try:
-            round_trip(minimal)  # to see whether the peer speaks the same
+            round_trip(minimal)  # checks that the peer speaks this protocol
             connection.settimeout(answer_s)
             pace = Pace(settings.period_ms)
             for phase, rounds in (

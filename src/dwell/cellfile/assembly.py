@@ -125,6 +125,7 @@ class Assembly:
             scenarios=scenarios,
             controller=controller,
             tiers=objective.tiers if objective is not None else {},
+            latency=objective.latency if objective is not None else None,
             live=live,
         )
         self._assume(parts)
@@ -303,6 +304,7 @@ class Assembly:
             caps=caps or Caps(),
             tiers=tiers,
             accelerators=accelerator_tiers(nodes, tiers) if entry.accelerators else {},
+            latency=entry.latency,
         )
 
     def _servo(self) -> Servo | None:

@@ -48,6 +48,7 @@ from dwell.model import (
     Link,
     LinkDisturbance,
     LiveSettings,
+    MissCap,
     MovingTarget,
     Node,
     NodeDisturbance,
@@ -412,7 +413,9 @@ def _disturbance() -> Shape:
 
 
 DISTURBANCE = _disturbance()
-WEIGHTS, TARGETS, CAPS = (shape_of(kind, {}) for kind in (Weights, Targets, Caps))
+MISSES = shape_of(MissCap, {})
+WEIGHTS, TARGETS = shape_of(Weights, {}), shape_of(Targets, {})
+CAPS = shape_of(Caps, {MissCap: MISSES})
 OBJECTIVE = shape_of(
     Objective,
     {},

@@ -49,7 +49,7 @@ class OpenCell:
     traces: dict[object, Tables] = field(repr=False)
 
     def changed(self, overrides: Iterable[Override]) -> OpenCell:
-        """Return the cell with values put into it.
+        """Return the cell with overridden values.
 
         Raises
         ------
@@ -66,7 +66,7 @@ class OpenCell:
     def attempt(
         self, overrides: Sequence[Override], faults: Faults, otherwise: str, where: str = ""
     ) -> OpenCell | None:
-        """Return the cell with values put into it, or record what is wrong where they are given.
+        """Return the cell with overridden values, or None with faults at the overrides' places.
 
         Parameters
         ----------

@@ -211,7 +211,7 @@ class _Reading:
     # ------------------------------------------------------------------------- scenarios
 
     def _with_scenarios(self, cell: OpenCell) -> OpenCell:
-        """Put the study's own scenarios into the cell; a fault leaves them all out."""
+        """Add the study's own scenarios to the cell; none if one has a fault."""
         own = [
             Override(f"scenarios.{name}", ("scenarios", name), items)
             for name, items in (self.entry.scenarios or {}).items()
@@ -500,7 +500,7 @@ class _FleetReading(_Reading):
 
 
 def _combinations(grid: Grid, axes: Axes) -> Iterator[tuple[dict[str, int], dict[str, Value]]]:
-    """Yield every combination of the values of axes: the place of each, and the value as shown."""
+    """Yield every combination of the axes' values: their indices and shown values, by path."""
     shown = {path: _shown(values) for path, values in grid.items()}
     for picked in itertools.product(*(range(len(grid[first])) for first, *_ in axes)):
         at = {path: i for axis, i in zip(axes, picked, strict=True) for path in axis}

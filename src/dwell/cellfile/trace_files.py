@@ -47,7 +47,7 @@ def read_traces(entry: Entry, folder: Path, faults: Faults) -> Tables:
     folder : Path
         Where relative file names start.
     faults : Faults
-        Takes what is wrong with the files.
+        Collects the faults of the files.
 
     Returns
     -------
@@ -86,7 +86,7 @@ class Reading:
     folder : Path
         Where relative file names start.
     faults : Faults
-        Takes what is wrong with the file.
+        Collects the faults of the file.
     """
 
     source: Source

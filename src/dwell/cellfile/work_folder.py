@@ -60,7 +60,7 @@ def open_work_folder(
     Parameters
     ----------
     description : mapping
-        JSON-able: all that the results depend on.
+        Everything that determines the results, as JSON-able values.
     notes : mapping, optional
         JSON-able: written next to the description, and replaced after a change.
 

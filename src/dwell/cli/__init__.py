@@ -33,6 +33,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except KeyboardInterrupt:
         sys.exit(ExitCode.INTERRUPTED)
     finally:
-        # CPython notes an interrupt that passes through `exec` of a text (a dataclass) and ends
-        # `python -m` by SIGINT for it, handled or not. The next `exec` takes the note back.
+        # CPython records an interrupt inside `exec` of a text (a dataclass), and then ends
+        # `python -m` by SIGINT even if it was handled. The next `exec` deletes the record.
         exec("")  # noqa: S102

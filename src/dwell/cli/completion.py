@@ -1,7 +1,7 @@
 """`dwell completion`: the shells' scripts, and the names that options take from a cell file.
 
-Typer completes commands, options and choices, and leaves paths to the shell. A function here
-returns the values of an option (its `autocompletion`) by the line before them and how they begin.
+Typer completes commands, options and choices, and leaves paths to the shell. Each
+function here completes the value of an option, from the words before it and its beginning.
 """
 
 from __future__ import annotations

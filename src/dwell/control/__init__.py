@@ -12,12 +12,21 @@ from dwell.control.guard import (
     parts_of,
 )
 from dwell.control.plain_rule import plain_rule
-from dwell.control.windows import final_l95_ms, moved_shares, overtaken_cycles, seen_costs
+from dwell.control.windows import (
+    NO_AGE,
+    age_l95_ms,
+    age_missed,
+    final_l95_ms,
+    moved_shares,
+    overtaken_cycles,
+    seen_costs,
+)
 from dwell.estimators import Estimator, Evidence, Instants
 from dwell.model.shadow_plan import ShadowPlan, shadow_stamps
 from dwell.policies import MinimalPolicy
 
 __all__ = [
+    "NO_AGE",
     "CellGuard",
     "ClosedWindow",
     "Controller",
@@ -34,6 +43,8 @@ __all__ = [
     "Probation",
     "Proposal",
     "ShadowPlan",
+    "age_l95_ms",
+    "age_missed",
     "final_l95_ms",
     "moved_shares",
     "overtaken_cycles",

@@ -204,6 +204,7 @@ class Controller:
         #: The incumbent whose windows are compared with its estimates.
         self._watched, self._watchdog = "", Watchdog(problem.window_cycles)
         self._doubts = Doubts(problem.window_cycles)
+        self._due_cycles = problem.due_cycles
         #: Last measured metrics under each candidate.
         self._seen_under: dict[str, QoS] = {}
         #: Cycles of the current decision, as the engine counts them.
@@ -225,6 +226,7 @@ class Controller:
         self._censor_ms = problem.censor_ms
         #: The policy's objective, else the cell's; its caps decide which candidates are eligible.
         self.objective: Objective = self._policy.objective or problem.objective
+        self._weighs_age = problem.objective.weighs_age
         #: Whether the objective has caps.
         self.has_caps = self.objective.caps != Caps()
 
@@ -252,6 +254,8 @@ class Controller:
             "support": self.supports,
             "fleet": self.coordination is not None,
             "between": self._has_looks,
+            "age": self._weighs_age,
+            "misses": self.objective.caps.misses is not None,
         }
         return tuple(feature for feature, there in has.items() if there)
 
@@ -347,6 +351,7 @@ class Controller:
         uncut_ms: float,
         shares: Floats,
         recent: Floats | None = None,
+        age_ms: float | None = None,
     ) -> Proposal:
         """Propose from the metrics of a window that the engine has computed (see `propose`).
 
@@ -359,21 +364,29 @@ class Controller:
             other cells; NaN if not measured.
         recent : float64 array, optional
             The same shares since the last decision, for the estimator; None for `shares`.
+        age_ms : float, optional
+            Mean age of the newest command; needed if J weighs it.
         """
-        observed = self._observed(l95_ms, violation_rate, uncut_ms, shares)
+        seen = l95_ms, violation_rate, uncut_ms, age_ms
+        observed = self._observed(*seen, shares)
         if recent is None:
             return self.propose_by(observed, self._own_shares(shares))
-        since = self._observed(l95_ms, violation_rate, uncut_ms, recent)
+        since = self._observed(*seen, recent)
         return self.propose_by(observed, self._own_shares(recent), since)
 
     def _observed(
-        self, l95_ms: float, violation_rate: float, uncut_ms: float, shares: Floats
+        self,
+        l95_ms: float,
+        violation_rate: float,
+        uncut_ms: float,
+        age_ms: float | None,
+        shares: Floats,
     ) -> QoS:
         """Return the metrics with the busy share of each resource."""
         used = dict(zip(self.resources, shares[0].tolist(), strict=True))
         if self._has_accelerators:
             used = _measured(used)
-        return QoS(l95_ms, violation_rate, FrozenDict(used), uncut_ms)
+        return QoS(l95_ms, violation_rate, FrozenDict(used), uncut_ms, age_ms=age_ms)
 
     def _own_shares(self, shares: Floats) -> dict[str, float]:
         """Return the share of each resource that is not foreign."""
@@ -423,6 +436,9 @@ class Controller:
         with UserCall(self.estimator, "estimate", self.looked.window):
             known = self._estimator.estimate(observed=recent, incumbent=incumbent, own=own)
             estimates = dict(known)
+        if self.objective.caps.misses is not None and isinstance(estimates.get(incumbent), QoS):
+            # A window has too few stretches for the cap.
+            observed = replace(observed, misses=estimates[incumbent].misses)
         if not self._estimator.learns:
             # Without learning, the window is the best estimate of the incumbent.
             estimates[incumbent] = observed
@@ -467,7 +483,7 @@ class Controller:
         deviations = self._estimator.deviations(incumbent)
         if deviations is None:
             return
-        played = Expected.of_estimate(estimate, deviations, self.problem.window_cycles)
+        played = Expected.of_estimate(estimate, deviations, self._due_cycles)
         if self._watchdog.compare(seen, played):
             self._doubts.change(incumbent, last_cycle, trusts=self._watchdog.trusts)
 
@@ -657,11 +673,12 @@ class Controller:
         self.decisions.append((*fixed, *cycles, dwell_cycles, *proposal.priced, *asked, why))
 
     def _looked_at(self, observed: QoS) -> tuple[float | None, ...]:
-        """Return the metrics of a decision, if a window can have several decisions."""
+        """Return the metrics of a decision, if a window can have several, and a weighed age."""
+        age_ms = (observed.age_ms,) if self._weighs_age else ()
         if not self._has_looks:
-            return ()
+            return age_ms
         used = map(observed.utilisation.get, self.resources)
-        return observed.l95_ms, observed.violation_rate, *used
+        return observed.l95_ms, observed.violation_rate, *used, *age_ms
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
         """Return the values of all candidates for a row of ``decisions``."""
@@ -675,6 +692,8 @@ class Controller:
             *[estimate.violation_rate for estimate in known],
             *[l95_ms for l95_ms, _ in errors],
             *[violation_rate for _, violation_rate in errors],
+            *([estimate.age_ms for estimate in known] if self._weighs_age else ()),
+            *([estimate.misses for estimate in known] if self.objective.caps.misses else ()),
             *[shares.get(name) for name in self.resources for shares in used],
             *self._capped(known),
             *self._supported(),

@@ -132,6 +132,7 @@ class MostServed(FleetRank):
         super().__init__(cells)
         self.limit: float = limit
         self._served: list[bool | None] = [None] * len(self.cells)
+        self._due_cycles = [cell.problem.due_cycles for cell in self.cells]
 
     def first(self, price: FleetPrice, absent: Collection[int] = ()) -> Rank:
         """Return minus the number of cells that are served."""
@@ -145,7 +146,7 @@ class MostServed(FleetRank):
         before, rate, count = self._served[index], cell.qos.violation_rate, len(cell.windows)
         error = max(
             float(cell.windows[:, 1].std()) / math.sqrt(count - 1),
-            unseen_error(rate, count * self.cells[index].problem.window_cycles),
+            unseen_error(rate, count * self._due_cycles[index]),
         )
         if before is None or abs(rate - self.limit) > DEVIATIONS * error:
             return rate <= self.limit

@@ -10,12 +10,13 @@ call `CellGuard.look` to learn whether to move.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import TypeAlias
 
 from dwell.control.course import Course
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import require
+from dwell.model.chain import ChainPatience
 from dwell.model.controller_settings import PROBE_CYCLES
 from dwell.model.instants import EVIDENCE_NS
 
@@ -58,6 +59,10 @@ class _Silence:
         while len(waiting) > kept and waiting[kept][1] <= at_ns - self.patience_ns:
             waiting.popleft()
 
+    def pass_over(self, cycle: int) -> None:
+        """Record the release of a cycle that it does not wait for."""
+        self.released = max(self.released, cycle)
+
     def complete(self, cycle: int) -> None:
         """Stop waiting for a completed cycle and all before it; ignore unknown cycles."""
         if self.newest < cycle <= self.released:
@@ -82,6 +87,38 @@ class _Silence:
         """Whether the patience has ended."""
         due_ns = self.due_ns
         return due_ns is not None and now_ns >= due_ns
+
+
+class _OriginSilence(_Silence):
+    """The wait for a newer origin of a chain than the newest one so far.
+
+    It keeps the newest origin itself, whose age counts. Without an origin it keeps the first cycle
+    that it waits for.
+
+    Parameters
+    ----------
+    every : int
+        Cycles from one origin to the next.
+    """
+
+    __slots__ = ("every",)
+
+    def __init__(self, patience_ns: int, every: int) -> None:
+        super().__init__(patience_ns)
+        self.every = every
+
+    def release(self, cycle: int, at_ns: int) -> None:
+        """Wait for the actuation of a cycle in which the chain has an origin."""
+        if cycle % self.every:
+            self.pass_over(cycle)
+        else:
+            super().release(cycle, at_ns)
+
+    def complete(self, cycle: int) -> None:
+        """Record an actuation with an origin, and stop waiting for all cycles before it."""
+        if self.newest < cycle <= self.released:
+            self.newest = cycle
+            self.skip(cycle - 1)
 
 
 class FallbackRound:
@@ -146,7 +183,8 @@ class Guard:
     """Decides when the cell must leave its placement without an order, and for which fallback.
 
     The guard *fires* when the cycle after the newest completed cycle is as old as the *patience*,
-    max(D, P) + (g - 1) P: the deadlines of g cycles have then passed. In detail:
+    max(D, P) + (g - 1) P: the deadlines of g cycles have then passed. It also fires when the newest
+    origin of a *guarded chain* is as old as the chain's patience. In detail:
 
     * The *newest completed* cycle has the highest number of all completed cycles, in whatever order
       their completions arrive. A late completion of an older cycle and a cycle lost between two
@@ -160,25 +198,28 @@ class Guard:
       new placement has the patience to complete its first cycle. Late completions of earlier cycles
       change nothing.
     * The guard ignores completions of cycles that were never released here.
+    * The newest origin of a chain is the highest cycle from which one of its actuations descends,
+      or, before there is one, the first cycle with an origin that the guard waits for. Moves, rests
+      and restarts apply to origins as they do to cycles.
 
     The guard is *on a fallback* from its own move until the next order. A fallback *carries* the
-    cell once one of its cycles has completed. If none completes within the patience, the fallback
-    has failed, and the guard tries the next one at once. It tries each fallback once per round, in
-    this order:
+    cell once one of its cycles has completed and each guarded chain has actuated from one of its
+    cycles. If one of these does not occur within its patience, the fallback has failed, and the
+    guard tries the next one at once. It tries each fallback once per round, in this order:
 
     1. the fallback that carried the cell before an order left it, until a cycle has completed that
        was released more than `probe_cycles` cycles after the last one under that fallback;
     2. the other fallbacks, best first;
     3. fallbacks that have failed since the last completed cycle or order, earliest failure first.
 
-    After its move the guard *rests* for `probe_cycles` cycles: once a first cycle has completed,
-    it does not wait for the remaining ones. It also rests when it has tried every available
-    fallback and no cycle has completed. The next round then begins when the guard would fire again,
-    but a fallback that becomes available is tried at once. Every further rest before an order is
-    twice as long, up to 32 times `probe_cycles`; this limits the moves of a cell that no fallback
-    can carry. After a rest the guard waits for cycles as under any placement, because the
-    controller may keep the fallback or may be down. A fallback ordered by the controller gets no
-    rest.
+    After its move the guard *rests* for `probe_cycles` cycles: once a first cycle has completed (or
+    a chain has actuated), it does not wait for the remaining ones. It also rests when it has tried
+    every available fallback and no cycle has completed. The next round then begins when the guard
+    would fire again, but a fallback that becomes available is tried at once. Every further rest
+    before an order is twice as long, up to 32 times `probe_cycles`; this limits the moves of a cell
+    that no fallback can carry. After a rest the guard waits for cycles as under any placement,
+    because the controller may keep the fallback or may be down. A fallback ordered by the
+    controller gets no rest.
 
     **Bound.** Assume that the guard does not rest, and that f fallbacks are available, at least one
     of which can carry the cell. Let n be D / P, rounded up: `Pipeline.open_cycles`. Then at most
@@ -200,6 +241,8 @@ class Guard:
         Length of the first rest in cycles, at least 1; also the probes that prove a placement.
     placement : str
         Candidate of the first cycles.
+    chains : mapping of str to ChainPatience, optional
+        Guarded chains, by name.
 
     Attributes
     ----------
@@ -211,6 +254,7 @@ class Guard:
 
     __slots__ = (
         "_carrier",
+        "_chains",
         "_rest",
         "_rest_last",
         "_rests",
@@ -219,6 +263,7 @@ class Guard:
         "_silence",
         "_since",
         "_spent_ns",
+        "_waits",
         "course",
         "probe_cycles",
     )
@@ -230,12 +275,18 @@ class Guard:
         patience_ns: int,
         probe_cycles: int,
         placement: str,
+        chains: Mapping[str, ChainPatience] | None = None,
     ) -> None:
         PROBE_CYCLES.check("probe_cycles", probe_cycles)
         require(patience_ns > 0, "patience_ns", patience_ns, "at least 1")
         self.probe_cycles = probe_cycles
         self.course = Course(placement)
         self._silence = _Silence(patience_ns)
+        self._chains = {
+            name: _OriginSilence(chain.patience_ns, chain.every)
+            for name, chain in (chains or {}).items()
+        }
+        self._waits: tuple[_Silence, ...] = (self._silence, *self._chains.values())
         self._round = FallbackRound(fallbacks)
         # Last cycle before the last move, and last cycle before an order left the fallback.
         self._since = self._returned = -1
@@ -277,9 +328,14 @@ class Guard:
         return self._silence.patience_ns
 
     @property
+    def chains(self) -> tuple[str, ...]:
+        """Names of the guarded chains."""
+        return tuple(self._chains)
+
+    @property
     def carries(self) -> bool:
-        """Whether a cycle has completed since the last move."""
-        return self._silence.newest > self._since
+        """Whether a cycle has completed, and each guarded chain actuated, since the last move."""
+        return all(wait.newest > self._since for wait in self._waits)
 
     @property
     def resting(self) -> bool:
@@ -288,31 +344,38 @@ class Guard:
 
     @property
     def waits_for(self) -> int:
-        """Earliest cycle, released or to come, that can make the guard fire."""
-        silence = self._silence
-        if silence.waiting:
-            return silence.waiting[0][0]
-        rests = self.carries or self._spent_ns is not None
-        return silence.released + 1 + (self._rest if rests else 0)
+        """Earliest cycle, released or to come, whose completion the guard may wait for."""
+        return self._waits_from(self._silence)
+
+    @property
+    def chain_waits(self) -> Iterator[tuple[int, int]]:
+        """Earliest cycle whose age may make the guard fire, and the patience, of each chain."""
+        return ((self._waits_from(wait), wait.patience_ns) for wait in self._chains.values())
+
+    def _waits_from(self, wait: _Silence) -> int:
+        if wait.waiting:
+            return wait.waiting[0][0]
+        rests = wait.newest > self._since or self._spent_ns is not None
+        return wait.released + 1 + (self._rest if rests else 0)
 
     @property
     def options(self) -> list[str]:
         """Fallbacks that the guard may try, next first."""
-        recent = self.newest <= self._returned + self.probe_cycles
+        recent = min(wait.newest for wait in self._waits) <= self._returned + self.probe_cycles
         return self._round.options(self.placement, self._carrier if recent else None)
 
-    def released(self, cycle: int, at_ns: int) -> None:
-        """Record the release of a stamped cycle."""
-        silence = self._silence
-        if not self._rest or cycle <= silence.released:
-            silence.release(cycle, at_ns)
-            return
-        self._rest -= 1
-        if self._spent_ns is None and not self.carries:
-            silence.release(cycle, at_ns)
-            self._rest_last = cycle
-        else:
-            silence.released = cycle
+    def released(self, cycle: int, at_ns: int, *, is_idle: bool = False) -> None:
+        """Record the release of a stamped cycle; an idle cycle has no completion."""
+        rests = self._rest > 0 and cycle > self._silence.released
+        self._rest -= rests
+        for wait in self._waits:
+            waits = not rests or (self._spent_ns is None and wait.newest <= self._since)
+            if rests and waits:
+                self._rest_last = cycle
+            if not waits or (is_idle and wait is self._silence):
+                wait.pass_over(cycle)
+            else:
+                wait.release(cycle, at_ns)
 
     def passed(self, cycles: int) -> None:
         """Record cycles released before a completed one, in place of `released` for each."""
@@ -320,9 +383,16 @@ class Guard:
 
     def completed(self, cycle: int, at_ns: int) -> None:
         """Record the completion of a cycle by every sink."""
-        self._silence.complete(cycle)
-        if self.carries:
-            self._silence.skip(self._rest_last)
+        self._complete(self._silence, cycle)
+
+    def actuated(self, chain: str, origin: int) -> None:
+        """Record an actuation of a guarded chain that descends from the cycle `origin`."""
+        self._complete(self._chains[chain], origin)
+
+    def _complete(self, wait: _Silence, cycle: int) -> None:
+        wait.complete(cycle)
+        if wait.newest > self._since:
+            wait.skip(self._rest_last)
 
     @property
     def due_ns(self) -> int | None:
@@ -332,9 +402,11 @@ class Guard:
         """
         if not any(name != self.placement for name in self.fallbacks):
             return None
-        if self._spent_ns is not None and not self.carries and self.options:
+        is_spent = self._spent_ns is not None and self._round.begun
+        if is_spent and not self.carries and self.options:
             return self._spent_ns
-        return self._silence.due_ns
+        dues = (wait.due_ns for wait in self._waits)
+        return min((due_ns for due_ns in dues if due_ns is not None), default=None)
 
     def check(self, now_ns: int, whole: Whole, heard: Whole | None = None) -> str | None:
         """Return the fallback to move to now, if any; begin a rest at the end of a round.
@@ -358,7 +430,7 @@ class Guard:
             return None
         if self.carries:
             self._round.over()
-        elif self._spent_ns is not None and self._silence.over(now_ns):
+        elif self._spent_ns is not None and any(wait.over(now_ns) for wait in self._waits):
             self._round.again()
         options = self.options
         for asked in (whole, whole if heard is None else heard):
@@ -405,11 +477,12 @@ class Guard:
         rests = self._rests
         self._rest = self.probe_cycles << min(rests - 1, MOST_DOUBLINGS) if rests else 0
         self._rest_last = -1
-        self._silence.forget()
+        self.restart()
 
     def restart(self) -> None:
-        """Forget all released cycles after an outage of the guard's own node."""
-        self._silence.forget()
+        """Forget all released cycles, as after an outage of the guard's own node."""
+        for wait in self._waits:
+            wait.forget()
 
 
 def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
@@ -509,9 +582,9 @@ class Failures:
 
     @classmethod
     def of(cls, problem: Problem) -> Failures:
-        """Return the failures of a cell, with k = g + 1 and the guard's patience."""
+        """Return the failures of a cell, with k = g + 1 and the guard's longest patience."""
         in_a_row = problem.controller.failures_in_a_row
-        return cls(problem.candidates, in_a_row, problem.guard_patience_ns)
+        return cls(problem.candidates, in_a_row, problem.longest_patience_ns)
 
     def released(self, candidate: str, cycle: int, at_ns: int) -> None:
         """Record the release of a cycle or its shadow through a candidate."""
@@ -599,7 +672,7 @@ class Probation:
         return cls(
             problem.controller.probe_cycles,
             health_cycles=HEALTH_WINDOWS * problem.window_cycles,
-            patience_ns=problem.guard_patience_ns,
+            patience_ns=problem.longest_patience_ns,
         )
 
     def __repr__(self) -> str:
@@ -695,23 +768,27 @@ class CellGuard(Guard):
         Probes; the caller reports the wanted placement and the cycles completed under orders.
     """
 
-    __slots__ = ("failures", "presence", "probation")
+    __slots__ = ("_sink_rates", "failures", "presence", "probation")
 
     def __init__(self, problem: Problem, placement: str | None = None) -> None:
-        settings = problem.controller
+        settings, rates = problem.controller, problem.pipeline.rates
+        self._sink_rates = {rates[name] for name in problem.pipeline.sinks}
         super().__init__(
             settings.fallbacks,
             patience_ns=problem.guard_patience_ns,
             probe_cycles=settings.probe_cycles,
             placement=placement or problem.initial,
+            chains=problem.chain_patiences,
         )
         self.presence, self.failures = Presence.of(problem), Failures.of(problem)
         self.probation = Probation.of(problem)
 
     def sent(self, cycle: int, at_ns: int, candidate: str) -> None:
-        """Record the release of a cycle through a candidate."""
-        self.released(cycle, at_ns)
-        self.failures.released(candidate, cycle, at_ns)
+        """Record the release of a cycle through a candidate; a cycle without a sink is idle."""
+        is_idle = all(cycle % rate for rate in self._sink_rates)
+        self.released(cycle, at_ns, is_idle=is_idle)
+        if not is_idle:
+            self.failures.released(candidate, cycle, at_ns)
 
     def shadow_sent(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Record the release of the shadow of a cycle through a candidate."""
@@ -725,6 +802,19 @@ class CellGuard(Guard):
         # Ignore a later cycle that was released through another placement than the current one.
         if candidate == self.placement or cycle <= self._since:
             self.completed(cycle, at_ns)
+
+    def acted(self, chain: str, origin: int, candidate: str) -> None:
+        """Record an actuation of a guarded chain.
+
+        Parameters
+        ----------
+        origin : int
+            Oldest cycle from which the actuation descends.
+        candidate : str
+            Placement of that cycle.
+        """
+        if candidate == self.placement or origin <= self._since:
+            self.actuated(chain, origin)
 
     def shadow_arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Record the completion of a shadow through a candidate."""

@@ -73,7 +73,7 @@ def _at_levels(
 
 
 def _at_some(cells: Sequence[Sequence[_Option]], first: int, end: int) -> Iterator[tuple[str, ...]]:
-    """Yield the cheapest placements at some of the levels."""
+    """Yield the cheapest placements at the levels of load from `first` to before `end`."""
     # Smallest sum of costs of the cells so far, by level and by their work.
     least, chosen = np.zeros((end - first, end)), []
     for options in cells:

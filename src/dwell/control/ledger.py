@@ -215,7 +215,7 @@ class FleetLedger:
         known = self._expected[index]
         if known is None or known[0] is not played:
             price = self._declared[index][self.placements[index]]
-            cycles = self.cells[index].problem.window_cycles
+            cycles = self.cells[index].problem.due_cycles
             known = played, Expected.of(played.windows, price, cycles)
             self._expected[index] = known
         return known[1]

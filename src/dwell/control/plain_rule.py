@@ -50,7 +50,8 @@ def plain_rule(controller: Controller) -> PlainRule | None:
     """Return the rule of a controller before its first window; None if the kernel has no such rule.
 
     The kernel needs one of the policies in `_KNOWN` and the estimator `Profile`, subclasses
-    excluded. The policy must use the candidates of the problem, and its objective, if any.
+    excluded. The policy must use the candidates of the problem, and its objective, if any. The
+    objective has neither ages nor a cap on misses.
     """
     problem, policy, profile = controller.problem, controller.policy, controller.estimator
     called, numbers = _KNOWN.get(type(policy), ("", None))
@@ -59,7 +60,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
     own: Any = policy
     if list(own.candidates.items()) != list(problem.candidates.items()):
         return None
-    if own.objective not in (None, problem.objective):
+    if own.objective not in (None, problem.objective) or problem.objective.beyond_cycles:
         return None
     names, nodes = list(problem.candidates), list(problem.fabric.nodes)
     resources = list(problem.fabric.resources)

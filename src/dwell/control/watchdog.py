@@ -50,7 +50,7 @@ class Expected(NamedTuple):
     violation_deviation: float
 
     @classmethod
-    def of(cls, windows: Floats, price: Price, window_cycles: int) -> Expected:
+    def of(cls, windows: Floats, price: Price, due_cycles: int) -> Expected:
         """Compute the expected values from simulated windows.
 
         Parameters
@@ -60,6 +60,8 @@ class Expected(NamedTuple):
         price : Price
             Price of the candidate in the declared cell. It has many more windows, so it includes
             rare events.
+        due_cycles : int
+            Cycles of a window in which a sink is due.
         """
         count = len(windows)
         l95_ms, rate = windows.mean(axis=0).tolist()
@@ -71,13 +73,13 @@ class Expected(NamedTuple):
             max(between[0], price.l95_deviation_ms),
             max(between[1], price.violation_deviation),
         )
-        return cls._of((l95_ms, rate), error, deviations, count * window_cycles)
+        return cls._of((l95_ms, rate), error, deviations, count * due_cycles)
 
     @classmethod
-    def of_estimate(cls, qos: QoS, deviations: tuple[float, float], window_cycles: int) -> Expected:
+    def of_estimate(cls, qos: QoS, deviations: tuple[float, float], due_cycles: int) -> Expected:
         """Compute the expected values from an estimate and the deviations of single windows."""
         means = qos.l95_ms, qos.violation_rate
-        return cls._of(means, qos.error or NO_ERROR, deviations, window_cycles)
+        return cls._of(means, qos.error or NO_ERROR, deviations, due_cycles)
 
     @classmethod
     def _of(

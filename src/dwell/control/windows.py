@@ -17,6 +17,9 @@ from dwell.model.number_arrays import Floats, Ints
 from dwell.model.order_statistic import order_statistic, rank_of
 from dwell.model.problem import Problem
 
+#: Age of a cycle without an actuation.
+NO_AGE = -1
+
 
 def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:
     """Count the cycles that are later than D, or unfinished at the end of their window.
@@ -97,6 +100,25 @@ def final_l95_ms(latency_ns: Ints) -> Floats:
     return ms
 
 
+def age_l95_ms(ages_ns: Ints) -> Floats:
+    """Return L95 of the ages in each window, ms; infinite for a window without actuations."""
+    is_known = ages_ns != NO_AGE
+    count = is_known.sum(axis=1)
+    ordered = np.sort(np.where(is_known, ages_ns / 1e6, np.inf), axis=1)
+    rank = np.maximum(rank_of(95, count), 1)
+    l95: Floats = np.take_along_axis(ordered, rank[:, None] - 1, axis=1)[:, 0]
+    return l95
+
+
+def age_missed(ages_ns: Ints, max_age_ms: float) -> Floats:
+    """Return the share of each window's actuations with a larger age; 1 without actuations."""
+    is_known = ages_ns != NO_AGE
+    count = is_known.sum(axis=1)
+    over: NDArray[np.bool_] = is_known & (ages_ns > max_age_ms * 1e6)
+    share: Floats = np.where(count > 0, over.sum(axis=1) / np.maximum(count, 1), 1.0)
+    return share
+
+
 def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Floats:
     """Return the busy share of each resource; for a node, the share of its cores.
 
@@ -142,15 +164,17 @@ def seen_costs(
     violation_rate: Floats,
     used: Mapping[str, Floats],
     switching: Floats,
+    age_ms: Floats | float = 0.0,
 ) -> Floats:
     """Return J of windows.
 
     Parameters
     ----------
-    l95_ms, violation_rate, switching : float64 array, shape (windows,)
+    l95_ms, violation_rate, switching, age_ms : float64 array, shape (windows,)
         `switching` is the sum of S over the moves that took effect in each window.
     used : mapping of str to float64 array, shape (windows,)
         Busy share of each resource.
     """
     robot, edge, cloud = busiest(used, problem)
-    return price(l95_ms, violation_rate, robot, edge, cloud, switching, problem.objective)
+    objective = problem.objective
+    return price(l95_ms, violation_rate, robot, edge, cloud, switching, objective, age_ms)

@@ -31,7 +31,12 @@ BUCKETS_S = (
 )
 #: Time between two readings of the cycle feed, which keeps only the newest cycles.
 EVERY_S = 2.0
-#: Help text of each metric except the latency histogram, by kind.
+#: Name and help text of the latency histogram.
+LATENCY = (
+    "dwell_cycle_latency_seconds",
+    "Time from the release of a cycle to the completion of its last sink.",
+)
+#: Help text of each other metric, by kind.
 SENTENCES: Mapping[Kind, Mapping[str, str]] = {
     "gauge": {
         "dwell_health": "1 for the current health of the cell, 0 for every other health.",
@@ -100,8 +105,7 @@ class CellMetrics(Collector):
         self._members = [role.who for role in roles(self._problem) if role.kind != "controller"]
         self._deadline_s = self._problem.pipeline.deadline_ns / 1e9
         self._latency = Histogram(
-            "dwell_cycle_latency_seconds",
-            "Time from the release of a cycle to the completion of its last sink.",
+            *LATENCY,
             ["cell"],
             buckets=sorted({*BUCKETS_S, self._deadline_s}),
             registry=None,

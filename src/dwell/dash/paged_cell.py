@@ -58,6 +58,7 @@ def cell_document(problem: Problem) -> Plain:
         "deadline_ms": pipeline.deadline_ms,
         "window_cycles": problem.window_cycles,
         "dwell_cycles": problem.dwell_cycles,
+        "weighs_age": problem.objective.weighs_age,
         "nodes": [
             {"name": node.name, "tier": node.tier, "cores": node.cores}
             for node in fabric.nodes.values()

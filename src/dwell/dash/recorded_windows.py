@@ -17,7 +17,12 @@ from dwell.record import Names, Run, shown_reason
 from dwell.record.moves import GUARD, by_guard
 
 #: Columns of the measured values by the names of their estimates.
-SEEN = {"l95_ms": "seen_l95_ms", "violation_rate": "seen_violation_rate", "cost": "cost"}
+SEEN = {
+    "l95_ms": "seen_l95_ms",
+    "violation_rate": "seen_violation_rate",
+    "cost": "cost",
+    "age_ms": "seen_age_ms",
+}
 #: Explanation of the reason of a move to the least bad of all candidates.
 INFEASIBLE = "all candidates are over a cap, this one least"
 
@@ -70,7 +75,9 @@ class RecordedWindows:
         self.rates = windows["violation_rate"].astype(np.float64)
         self.counts = ~windows["warmup"].astype(bool)
         self.placement = placement_codes(windows.names("placement"), self._candidates)
-        self.seen = {name: windows[of].astype(np.float64) for name, of in SEEN.items()}
+        self.seen = {
+            name: windows[of].astype(np.float64) for name, of in SEEN.items() if of in windows
+        }
         self.used = {
             name: windows[f"u_{name}"].astype(np.float64) for name in problem.fabric.resources
         }
@@ -157,7 +164,7 @@ class RecordedWindows:
                 "begin": float(self.opens[k]),
                 "end": float(self.closes[k]),
                 "placement": self._candidates[self.placement[k]],
-                "seen": {name: plain(self.seen[name][k : k + 1], 4)[0] for name in SEEN},
+                "seen": {name: plain(of[k : k + 1], 4)[0] for name, of in self.seen.items()},
             },
             **({} if row < 0 else {"decision": self._decision(row)}),
         }
@@ -184,11 +191,16 @@ class RecordedWindows:
 
     def _estimate(self, row: int, name: str) -> Plain:
         """Return the estimates of a candidate at a decision; `eligible` means within all caps."""
-        columns = (f"j_{name}", f"est_l95_ms_{name}", f"est_violation_rate_{name}")
-        values = self._numbers(row, *columns)
+        estimates = {
+            "cost": f"j_{name}",
+            "l95_ms": f"est_l95_ms_{name}",
+            "violation_rate": f"est_violation_rate_{name}",
+            "age_ms": f"est_age_ms_{name}",
+        }
+        known = {key: column for key, column in estimates.items() if column in self.decisions}
+        values = self._numbers(row, *known.values())
         within = bool(self.decisions[f"eligible_{name}"][row])
-        found = zip(("cost", "l95_ms", "violation_rate"), values.values(), strict=True)
-        return {**dict(found), "eligible": within}
+        return {**dict(zip(known, values.values(), strict=True)), "eligible": within}
 
     def _numbers(self, row: int, *columns: str) -> Plain:
         """Return values of a decision by column; None if unknown."""

@@ -182,7 +182,7 @@ class Dash:
         return JSONResponse(await run_in_threadpool(cell.jobs, begin, end))
 
     async def _shown(self, request: Request) -> PagedCell | RecordedFleet:
-        """Return the cell in a request; without its number, the fleet if the page has one."""
+        """Return the cell that a request names; the page's fleet if it names none."""
         if self.fleet is not None and "cell" not in request.query_params:
             return self.fleet
         return await self._cell(request)

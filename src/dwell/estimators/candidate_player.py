@@ -45,6 +45,11 @@ class PlayedWindows(NamedTuple):
         return self.seen["uncut_ms"]
 
     @property
+    def age_ms(self) -> Floats:
+        """Mean age of the newest command; 0 unless J weighs it."""
+        return self.seen["age_ms"]
+
+    @property
     def missed(self) -> Ints:
         """Number of cycles that missed the deadline."""
         return self.seen["missed"]
@@ -56,7 +61,7 @@ class PlayedWindows(NamedTuple):
 
     @property
     def violation_rate(self) -> Floats:
-        """V_D."""
+        """Share of the counted cycles that missed."""
         return self.missed / self.counted
 
 
@@ -175,9 +180,10 @@ def _most_threads(node: Node) -> int:
 
 
 def with_windows_up_to(cycles: int, problem: Problem) -> Problem:
-    """Return a problem whose windows have at most some cycles."""
-    if problem.window_cycles <= cycles:
+    """Return a problem whose windows have at most some cycles, or one run of each sink."""
+    most = max(cycles, problem.pipeline.sink_cycles)
+    if problem.window_cycles <= most:
         return problem
-    every = min(problem.decide_cycles, cycles)
+    every = min(problem.decide_cycles, most)
     controller = replace(problem.controller, decide_cycles=every)
-    return replace(problem, window_cycles=cycles, controller=controller)
+    return replace(problem, window_cycles=most, controller=controller)

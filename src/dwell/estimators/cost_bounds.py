@@ -7,22 +7,30 @@ links. The latency of a cycle is bounded by its paths and by the work of each re
 A cycle that its window's end finds unfinished counts as missed and may leave its work undone. The
 bound therefore charges each cycle with the smaller of two costs: a miss, or its work and the miss
 that its latency implies.
+
+With several rates only the tasks that are needed in a cycle count: those from which waited flows
+lead to a sink that is due. All other work may be left undone without a miss. Idle cycles have no
+latency and miss nothing.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from dwell.cost import tier_nodes
 from dwell.estimators.any_placement import AnyPlacement
+from dwell.estimators.needed_cycles import Mask, NeededCycles
 from dwell.model.fabric import Resource
 from dwell.model.number_arrays import Floats, Ints
-from dwell.model.order_statistic import order_statistic
+from dwell.model.order_statistic import order_statistic, rank_of
 from dwell.model.window_close import window_close_ns
+
+#: An instant later than all others; the sum of two stays within 64 bits.
+FAR_NS = 1 << 61
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +47,22 @@ class ResourceWork:
         span_ns += self.earliest_ns
         span_ns += self.tail_ns
         return span_ns
+
+    def joined(self, other: ResourceWork) -> ResourceWork:
+        """Return this work and more."""
+        return ResourceWork(
+            np.minimum(self.earliest_ns, other.earliest_ns),
+            self.work_ns + other.work_ns,
+            np.minimum(self.tail_ns, other.tail_ns),
+        )
+
+    def only(self, needed: Mask) -> ResourceWork:
+        """Return the work of some cycles; the others have none."""
+        return ResourceWork(
+            np.where(needed, self.earliest_ns, FAR_NS),
+            np.where(needed, self.work_ns, 0),
+            np.where(needed, self.tail_ns, FAR_NS),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,19 +86,26 @@ class CostBounds:
 
     def __init__(self, sample: AnyPlacement) -> None:
         problem, real = sample.problem, sample.realisation
+        pipeline = problem.pipeline
         self._problem, self._width = problem, problem.window_cycles
-        self.order = problem.pipeline.topological()
+        self.order = pipeline.topological()
+        self._waited = {name: pipeline.waited(name) for name in self.order}
+        self._needed = NeededCycles(pipeline, real.cycles)
+        self._never = {name for name in self.order if self._needed.is_never(name)}
+        self._has_rates = pipeline.has_rates
         # What a window's end knows of a cycle is at most its age then.
         last_ns = real.release_ns[self._width - 1 : -1 : self._width]
         beyond_ns = real.release_ns[self._width :: self._width]
         close_ns = window_close_ns(problem, last_ns, beyond_ns)
         self._age_ns = np.repeat(close_ns, self._width) - real.release_ns[:-1]
-        self._due_ns = np.minimum(self._age_ns, problem.pipeline.deadline_ns)
+        self._deadline_ns = np.minimum(self._age_ns, pipeline.deadline_ns)
+        self._miss_cost = self._cost_of_a_miss()
         self._longest_ms = round(problem.censor_ms * 1e6) / 1e6
         # Times beyond the age count as the age, so sums stay within 64 bits.
         most_ns = int(self._age_ns.max()) + 1
         self._exec_ns = dict(zip(real.sites, np.minimum(real.exec_ns, most_ns), strict=True))
-        delay_ns = zip(real.hops, np.minimum(real.delay_ns, most_ns), strict=True)
+        # The rows of forwards follow; without moves nothing is forwarded.
+        delay_ns = zip(real.hops, np.minimum(real.delay_ns, most_ns), strict=False)
         self._hop_ns = {
             hop: row + min(self._transmission_ns(hop), most_ns) for hop, row in delay_ns
         }
@@ -93,28 +124,33 @@ class CostBounds:
     def placed(self, partial: Partial, node: str) -> Partial:
         """Return a partial placement with its next task on a node."""
         name = self.order[len(partial.nodes)]
-        task = self._problem.pipeline.tasks[name]
+        task, needed = self._problem.pipeline.tasks[name], self._needed.of[name]
+        nodes = {**partial.nodes, name: node}
+        if name in self._never:
+            return replace(partial, nodes=nodes)
         start_ns = np.full(len(self._age_ns), round(task.offset_ms * 1e6))
-        for flow in self._problem.pipeline.inputs(name):
+        for flow in self._waited[name]:
             sent_ns, source = partial.finish_ns[flow.source], partial.nodes[flow.source]
             if source != node:
                 sent_ns = sent_ns + self._hop_ns[flow.source, name, f"{source}->{node}"]
             np.maximum(start_ns, sent_ns, out=start_ns)
         finish_ns = start_ns + self._exec_ns[name, node]
         tail_ns = self._tail_ns[name, node]
-        latency_ns = np.maximum(partial.latency_ns, finish_ns + tail_ns)
+        reached_ns = finish_ns + tail_ns
         resource, work_ns = self._work(name, node)
         load = ResourceWork(start_ns, work_ns, tail_ns)
+        if needed is not None:
+            reached_ns, load = np.where(needed, reached_ns, 0), load.only(needed)
+        latency_ns = np.maximum(partial.latency_ns, reached_ns)
         if resource.name in partial.loads:
-            before = partial.loads[resource.name]
-            load = ResourceWork(
-                np.minimum(before.earliest_ns, start_ns),
-                before.work_ns + work_ns,
-                np.minimum(before.tail_ns, tail_ns),
-            )
-            np.maximum(latency_ns, load.latency_ns(resource.capacity), out=latency_ns)
+            load = partial.loads[resource.name].joined(load)
+            span_ns = load.latency_ns(resource.capacity)
+            if self._has_rates:
+                # Cycles without work on the resource; paths bound the others without work.
+                span_ns[load.work_ns == 0] = 0
+            np.maximum(latency_ns, span_ns, out=latency_ns)
         return Partial(
-            {**partial.nodes, name: node},
+            nodes,
             {**partial.finish_ns, name: finish_ns},
             latency_ns,
             {**partial.loads, resource.name: load},
@@ -124,13 +160,35 @@ class CostBounds:
         """Return a lower bound of J, without the switching term."""
         objective = self._problem.objective
         weights, targets = objective.weights, objective.targets
-        seen_ns = np.minimum(partial.latency_ns, self._age_ns).reshape(-1, self._width)
-        l95_ms = order_statistic(seen_ns, 95) / 1e6
+        l95_ms = self._l95_ns(np.minimum(partial.latency_ns, self._age_ns)) / 1e6
         latency = weights.latency * np.minimum(l95_ms, self._longest_ms).mean()
-        most = weights.violations / len(self._age_ns)
-        missed = np.where(partial.latency_ns > self._due_ns, most, 0.0)
+        most = self._miss_cost
+        missed = np.where(partial.latency_ns > self._deadline_ns, most, 0.0)
         work = max(float(np.minimum(missed + cost, most).sum()) for cost in self._by_cycle(partial))
         return float(latency) / targets.latency_ms + work
+
+    def _l95_ns(self, seen_ns: Ints) -> Ints:
+        """Return L95 of every window."""
+        if self._needed.due is None:
+            return order_statistic(seen_ns.reshape(-1, self._width), 95)
+        windows = np.where(self._needed.due, seen_ns, FAR_NS).reshape(-1, self._width)
+        ranks = rank_of(95, self._needed.due.reshape(-1, self._width).sum(axis=1))
+        return np.take_along_axis(np.sort(windows, axis=1), ranks[:, None] - 1, axis=1)[:, 0]
+
+    def _cost_of_a_miss(self) -> Floats:
+        """Return J of a miss in each cycle; 0 for idle cycles."""
+        weight, cycles = self._problem.objective.weights.violations, len(self._age_ns)
+        if self._needed.due is None:
+            return np.full(cycles, weight / cycles)
+        windows = self._needed.due.reshape(-1, self._width)
+        counted = len(windows) * windows.sum(axis=1, keepdims=True)
+        return np.where(windows, weight / counted, 0.0).ravel()
+
+    def _needed_work(self, name: str, node: str) -> tuple[Resource, Ints]:
+        """Return the resource of a task on a node, and the work of the jobs that are needed."""
+        resource, work_ns = self._work(name, node)
+        needed = self._needed.of[name]
+        return resource, work_ns if needed is None else np.where(needed, work_ns, 0)
 
     def overloaded(self, partial: Partial) -> str | None:
         """Return a resource with more work than it can do if no message is lost.
@@ -152,7 +210,7 @@ class CostBounds:
         pipeline = self._problem.pipeline
         found: set[str] = set()
         for name in self.order:
-            before = (flow.source in found for flow in pipeline.inputs(name))
+            before = (flow.source in found for flow in self._waited[name])
             if pipeline.tasks[name].depth == 0 and all(before):
                 found.add(name)
         return frozenset(found)
@@ -185,6 +243,8 @@ class CostBounds:
             for node in pipeline.tasks[name].on:
                 longest = np.zeros(len(self._age_ns), np.int64)
                 for flow in pipeline.outputs(name):
+                    if flow.sampled:
+                        continue
                     ways = [
                         self._exec_ns[flow.target, other] + tails[flow.target, other] + hop_ns
                         for other in pipeline.tasks[flow.target].on
@@ -192,7 +252,10 @@ class CostBounds:
                         is not None
                     ]
                     if ways:
-                        np.maximum(longest, np.minimum.reduce(ways), out=longest)
+                        least = np.minimum.reduce(ways)
+                        if (needed := self._needed.of[flow.target]) is not None:
+                            least = np.where(needed, least, 0)
+                        np.maximum(longest, least, out=longest)
                 tails[name, node] = longest
         return tails
 
@@ -227,7 +290,7 @@ class CostBounds:
         for name in reversed(self.order):
             ways = []
             for node in self._problem.pipeline.tasks[name].on:
-                resource, work_ns = self._work(name, node)
+                resource, work_ns = self._needed_work(name, node)
                 ways.append(work_ns * self._costs.get(resource.name, ("", 0.0, 0.0))[2])
             left.append(left[-1] + np.minimum.reduce(ways))
         return left[::-1]

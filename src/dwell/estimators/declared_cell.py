@@ -10,13 +10,12 @@ import numpy as np
 
 from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import Meter, Part, parts_of
+from dwell.estimators.measured import Meter, Part, parts_of, patience_of
 from dwell.estimators.pool import Reference
 from dwell.estimators.prices import SEED, Question, most_windows
 from dwell.estimators.remembered import Remembered
 from dwell.estimators.sent_shadows import SentShadows
 from dwell.estimators.slow_processes import slow_processes
-from dwell.estimators.spans import patience_ns
 from dwell.kernels.advance import LoggedCycles
 from dwell.kernels.arrays import CellArrays, flow_rows
 from dwell.kernels.random_draws import Drawing
@@ -45,6 +44,8 @@ class Declared:
     l95_ms: Mapping[str, Floats]
     #: V_D of every window, by candidate.
     violation_rate: Mapping[str, Floats]
+    #: Mean age of every window, by candidate; 0 unless J weighs it.
+    age_ms: Mapping[str, Floats]
     #: The simulated shadow jobs, if they slow any candidate down.
     shadows: SentShadows | None = None
 
@@ -70,15 +71,18 @@ def _played(question: Question) -> Declared:
         shadows = SentShadows(problem, plain.realisation, question.shadow_fractions)
         player = CandidatePlayer([(problem, plain.realisation)], shadows=shadows)
         # Shadow jobs delay only these candidates.
-        l95_ms, rates = _shown(player, [n for n, of in question.shadow_fractions.items() if of])
-        l95_ms, rates = {**plain.l95_ms, **l95_ms}, {**plain.violation_rate, **rates}
-        known = FrozenDict(l95_ms), FrozenDict(rates)
-        return replace(plain, l95_ms=known[0], violation_rate=known[1], shadows=shadows)
+        slowed = _shown(player, [n for n, of in question.shadow_fractions.items() if of])
+        known = plain.l95_ms, plain.violation_rate, plain.age_ms
+        l95_ms, rates, age_ms = (
+            FrozenDict({**one, **other}) for one, other in zip(known, slowed, strict=True)
+        )
+        return replace(plain, l95_ms=l95_ms, violation_rate=rates, age_ms=age_ms, shadows=shadows)
     windows = max(-(-DRAWN // problem.window_cycles), FEWEST)
     real = _drawn_as_declared(problem, question.seed, windows)
-    l95_ms, rates = _shown(CandidatePlayer([(problem, real)]), problem.candidates)
+    shown = _shown(CandidatePlayer([(problem, real)]), problem.candidates)
     references = _references(problem, question.seed, windows)
-    return Declared(real, FrozenDict(references), FrozenDict(l95_ms), FrozenDict(rates))
+    l95_ms, rates, age_ms = map(FrozenDict, shown)
+    return Declared(real, FrozenDict(references), l95_ms, rates, age_ms)
 
 
 def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Reference]:
@@ -92,13 +96,13 @@ def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Referen
         problem, seed, min(max(windows, math.ceil(least / problem.window_cycles)), most)
     )
     player, meter = CandidatePlayer([(problem, real)], log_jobs=True), Meter(problem)
-    patience_ms = max(patience_ns(problem) / 1e6, problem.pipeline.deadline_ms)
     references: dict[Part, Reference] = {}
     for name, placement in problem.candidates.items():
         missing = [part for part in parts_of(problem.pipeline, placement) if part not in references]
         if missing:
             demands = meter.demands(_evidence_of(player, name))
-            for part in missing:
+            for part, patience_ns in zip(missing, patience_of(problem, missing), strict=True):
+                patience_ms = max(patience_ns / 1e6, problem.pipeline.deadline_ms)
                 values = demands.get(part, np.empty(0)).copy()
                 block = min(problem.window_cycles, STEP)
                 kept = windows * problem.window_cycles
@@ -112,12 +116,13 @@ def _drawn_as_declared(problem: Problem, seed: int, windows: int) -> Realisation
 
 def _shown(
     player: CandidatePlayer, names: Iterable[str]
-) -> tuple[dict[str, Floats], dict[str, Floats]]:
-    """Return L95, milliseconds, and V_D of every window, by candidate."""
+) -> tuple[dict[str, Floats], dict[str, Floats], dict[str, Floats]]:
+    """Return L95 (ms), V_D and the mean age (ms) of every window, by candidate."""
     shown = {name: player.windows(player.play({0: name})) for name in names}
     return (
         {name: windows.l95_ms.copy() for name, windows in shown.items()},
         {name: windows.violation_rate for name, windows in shown.items()},
+        {name: windows.age_ms.copy() for name, windows in shown.items()},
     )
 
 

@@ -38,7 +38,7 @@ CYCLES, FEWEST = 10_000, 9
 
 @dataclass(frozen=True, slots=True)
 class PricedCell:
-    """A cell of a fleet, with all that its price depends on."""
+    """A cell of a fleet, with everything that determines its price."""
 
     name: str
     #: With its phase.
@@ -221,7 +221,8 @@ class FleetPrices:
         uncut_ms = float(played.uncut_ms.mean())
         shares = self._used(arrays, i).items()
         used = FrozenDict((name, share) for name, share in shares if name not in terms.of_shared)
-        qos = QoS(l95_ms, rate, used, max(uncut_ms, l95_ms))
+        age_ms = float(played.age_ms.mean())
+        qos = QoS(l95_ms, rate, used, max(uncut_ms, l95_ms), age_ms=age_ms)
         return CellPrice(qos, terms.cost(qos), windows)
 
     def _used(self, arrays: Arrays, i: int) -> dict[str, float]:

@@ -62,6 +62,17 @@ def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
             yield message
 
 
+def patience_of(problem: Problem, parts: Iterable[Part]) -> list[int]:
+    """Return the patience with each part (see `patience_ns`), nanoseconds."""
+    pipeline, rates = problem.pipeline, problem.pipeline.rates
+    of_flows = {(flow.source, flow.target): pipeline.message_rate(flow) for flow in pipeline.flows}
+    every = (
+        of_flows[part.source, part.target] if isinstance(part, Message) else rates[part.task]
+        for part in parts
+    )
+    return [patience_ns(problem, rate) for rate in every]
+
+
 class Meter:
     """Times and demands of parts, from the jobs and messages of a window.
 
@@ -78,11 +89,12 @@ class Meter:
         every = (parts_of(problem.pipeline, placed) for placed in self._placements)
         self.parts = tuple(dict.fromkeys(part for parts in every for part in parts))
         self._number = {part: number for number, part in enumerate(self.parts)}
-        self._times = PartTimes(len(self.parts))
+        more_ns = self._more_patience_ns()
+        self._times = PartTimes(len(self.parts), more_ns=more_ns)
         costs = [_cost(problem, part) for part in self.parts]
         self._cost, self._usual_cost = np.array(costs), np.array(costs)
         self._link, repeats = self._links()
-        self._demands = PartTimes(len(self.parts), self._cost, self._link, repeats)
+        self._demands = PartTimes(len(self.parts), self._cost, self._link, repeats, more_ns)
         nodes = problem.fabric.nodes
         #: Parts whose jobs need more core time next to foreign threads, with their nodes.
         self._interfered = [
@@ -255,6 +267,13 @@ class Meter:
         names = [part.link if isinstance(part, Message) else "" for part in self.parts]
         waits = np.array([number.get(name, -1) for name in names], np.int64)
         return waits, np.array([name in repeating for name in names], np.int64)
+
+    def _more_patience_ns(self) -> Ints | None:
+        """Return by part the patience beyond a part's of each cycle; None without rates."""
+        if not self._pipeline.has_rates:
+            return None
+        patience = patience_of(self._problem, self.parts)
+        return np.array(patience, np.int64) - self._patience_ns
 
     def _layout(self, active: int) -> CyclesLayout:
         """Return the parts of cycles under a candidate, and of their shadows."""

@@ -25,7 +25,7 @@ from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
 from dwell.estimators.protocol import CellEstimator
-from dwell.estimators.spans import patience_ns
+from dwell.estimators.spans import task_patience_ns
 from dwell.estimators.stepwise_player import StepwisePlayer
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
@@ -69,7 +69,7 @@ class Online(CellEstimator):
         self.revision = 0
         self._grown = self._until = 1
         self._plays = False
-        self._patience_ns = patience_ns(problem)
+        self._patience_ns = task_patience_ns(problem)
         self._sent = {name: self._sent_under(name) for name in problem.candidates}
         #: Price and work of each candidate as declared, cached at the first estimate.
         self._declared: dict[str, tuple[QoS, list[tuple[str, float]]]] = {}
@@ -180,7 +180,7 @@ class Online(CellEstimator):
         for name in names:
             one, error = estimates[name], self._stated_error(name)
             known = one.l95_ms, one.violation_rate, one.utilisation, one.cut_from_ms
-            estimates[name] = unchecked_qos(*known, error)
+            estimates[name] = unchecked_qos(*known, error, self._stated_age(name), one.misses)
         if self.problem.every_placement is not None:
             return self._paired(names, estimates, incumbent)
         return estimates
@@ -223,6 +223,15 @@ class Online(CellEstimator):
         l95_error_ms, violation_error = played.error or NO_ERROR
         return math.hypot(l95_error_ms, known[0]), math.hypot(violation_error, known[1])
 
+    def _stated_age(self, name: str) -> tuple[float, float] | None:
+        """Return the mean age and its error; measured samples have the relative error of L95."""
+        played = self._player.played(name)
+        if played.age_ms is None:
+            return None
+        known_ms, _ = self._known_error(name, played.violation_rate, self._parts[name])
+        share = known_ms / played.l95_ms if played.l95_ms else 0.0
+        return played.age_ms, math.hypot(played.age_error_ms, share * played.age_ms)
+
     def deviations(self, name: str) -> tuple[float, float]:
         """Return standard deviations of one window under a candidate (see `CellEstimator`)."""
         return self._player.deviations(name)
@@ -241,7 +250,13 @@ class Online(CellEstimator):
         shares = self.profile.with_work(foreign, ((name, priced[name][1]) for name in priced))
         return {
             name: unchecked_qos(
-                qos.l95_ms, qos.violation_rate, shares[name], qos.cut_from_ms, qos.error
+                qos.l95_ms,
+                qos.violation_rate,
+                shares[name],
+                qos.cut_from_ms,
+                qos.error,
+                qos.age,
+                qos.misses,
             )
             for name, (qos, _) in priced.items()
         }
@@ -277,8 +292,8 @@ class Online(CellEstimator):
 
     def _sampled(self, name: str) -> float:
         """Return the standard error of a candidate's J due to few simulated cycles."""
-        error = self._player.played(name).error or NO_ERROR
-        return cost_error(error, self.problem.objective)
+        played = self._player.played(name)
+        return cost_error(played.error or NO_ERROR, self.problem.objective, played.age_error_ms)
 
     def _look_at_nodes(
         self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
@@ -300,7 +315,7 @@ class Online(CellEstimator):
     def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
         """Yield idle nodes that have lost at least two jobs since their last completed job."""
         limit_ns = evidence.close_ns - self._patience_ns
-        if not evidence.rows.unknown(limit_ns)[0]:
+        if not evidence.rows.unknown(int(limit_ns.max()))[0]:
             return
         cycles, placements = evidence.cycles, tuple(self.problem.candidates.values())
         lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)

@@ -85,7 +85,7 @@ class Ranking:
 
     @property
     def is_tie(self) -> bool:
-        """Whether the two best placements are not told apart."""
+        """Whether the samples do not show which of the two best placements is better."""
         gain, error = self.difference
         return bool(gain < APART * error) or gain == 0.0
 
@@ -104,8 +104,8 @@ def search(
     problem : Problem
         Its candidates do not matter.
     cycles : int
-        Simulated cycles of each placement, the same for all, at least 1. A scenario with
-        disturbances is simulated for 300 windows instead.
+        Simulated cycles of each placement, the same for all, at least 1, and enough for a run of
+        each sink. A scenario with disturbances is simulated for 300 windows instead.
     seed : int
         Of the samples, at least 0.
     top : int
@@ -126,7 +126,7 @@ def search(
     PlacementError
         If no placement is feasible; with the reasons.
     SimulationError
-        If `cycles`, `seed` or `top` is out of range, or tasks have several rates.
+        If `cycles`, `seed` or `top` is out of range, or the objective has ages or a cap on misses.
     """
     ranking = rank(problem, (scenario,), cycles=cycles, seed=seed, top=top)
     return [(one.placement, one.qos, one.cost) for one in ranking.best]
@@ -145,16 +145,19 @@ def rank(
 
     `most` is the largest number of partial placements to look at.
     """
-    if problem.pipeline.has_rates:
+    if name := problem.objective.beyond_cycles:
         raise SimulationError(
-            f"cell {problem.name!r} has `every` or `sampled`, which the search of placements does "
-            "not support; remove them, or list the candidates"
+            f"cell {problem.name!r} has objective.{name}, which the search of placements does not "
+            "support; remove it, or list the candidates"
         )
     for name, value, least in (("cycles", cycles, 1), ("seed", seed, 0), ("top", top, 1)):
         if isinstance(value, bool) or value < least:
             raise SimulationError(
                 f"{name} is {value!r}; it must be a whole number of at least {least}"
             )
+    if cycles < (interval := problem.pipeline.sink_cycles):
+        bound = f"at least {interval}, the cycles from one run to the next of the slowest sink"
+        raise SimulationError(f"cycles is {cycles}; it must be {bound}")
     # A realisation needs at least one candidate.
     named = problem.candidates or {"first": _first_linked(problem)}
     problem = replace(problem, candidates=named, every_placement=None)
@@ -171,7 +174,7 @@ def rank_until_apart(
 
     Scenarios with disturbances have a fixed length, and are searched once.
     """
-    cycles = FIRST_CYCLES
+    cycles = max(FIRST_CYCLES, problem.pipeline.sink_cycles)
     while True:
         ranking = rank(problem, scenarios, cycles=cycles, seed=seed, top=max(top, 2))
         is_fixed = any(problem.scenario(name) for name in scenarios)

@@ -308,7 +308,7 @@ class Pool:
         return run
 
     def _since(self, run: _Doubt, values: Floats) -> Floats:
-        """Return the values of a run: held values, then `values`, which are not held yet."""
+        """Return the newest values of a run: held values, then the new `values`."""
         added = run.apart.size - len(values)
         since = np.concatenate((self.held[max(len(self.held) - added, 0) :], values))
         return since[-LARGEST:]

@@ -19,7 +19,11 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
+from dwell.estimators.candidate_player import (
+    CandidatePlayer,
+    PlayedWindows,
+    with_windows_up_to,
+)
 from dwell.estimators.remembered import Remembered
 from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
@@ -29,13 +33,15 @@ from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.instants import NEVER_NS, longest_run
 from dwell.model.number_arrays import Floats, Ints
+from dwell.model.objective import MissCap
 from dwell.model.order_statistic import order_statistic
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.qos import QoS
+from dwell.model.qos import NO_AGE, QoS
 from dwell.model.scenario import Scenario
 from dwell.model.shadow_plan import ShadowFraction, by_candidate
+from dwell.model.stretches import share_over
 
 SEED = 20_250_601
 #: Standard errors to reach: of L95 as a share of it, and of V_D.
@@ -94,13 +100,18 @@ class Price:
     is_settled: bool
     l95_deviation_ms: float
     violation_deviation: float
+    #: Mean age of the newest command and its standard error, milliseconds, if J weighs it.
+    age: tuple[float, float] | None = None
+    #: Share of the stretches of k cycles with more than m misses, if misses are capped.
+    misses: float | None = None
 
     @property
     def qos(self) -> QoS:
         """The price as a QoS, with the declared foreign load."""
         used = {name: min(share + self.foreign[name], 1.0) for name, share in self.own.items()}
         error = self.l95_error_ms, self.violation_error
-        return QoS(self.l95_ms, self.violation_rate, used, self.uncut_l95_ms, error)
+        metrics = self.l95_ms, self.violation_rate, used, self.uncut_l95_ms
+        return QoS(*metrics, error, *(self.age or NO_AGE), self.misses)
 
     @property
     def is_good_enough(self) -> bool:
@@ -111,7 +122,9 @@ class Price:
     def wanted(self) -> float:
         """Factor by which the simulation must grow."""
         l95 = self.l95_error_ms / (L95_SHARE * self.l95_ms) if self.l95_error_ms else 0.0
-        errors = max(l95, self.violation_error / RATE)
+        age_ms, age_error_ms = self.age or (1.0, 0.0)
+        age = age_error_ms / (L95_SHARE * age_ms) if age_error_ms else 0.0
+        errors = max(l95, self.violation_error / RATE, age)
         return errors * errors
 
 
@@ -131,6 +144,10 @@ class Question:
     seed: int
     cycles: int | None
     shadow_fractions: Mapping[str, float]
+    #: Chain whose data age counts as latency; whether J weighs the mean age; the cap on misses.
+    latency: str | None
+    weighs_age: bool
+    misses: MissCap | None
     problem: Problem = field(compare=False, repr=False)
 
     @classmethod
@@ -161,6 +178,9 @@ class Question:
             seed=seed,
             cycles=cycles,
             shadow_fractions=FrozenDict(sent if any(sent.values()) else {}),
+            latency=problem.objective.latency,
+            weighs_age=problem.objective.weighs_age,
+            misses=problem.objective.caps.misses,
             problem=problem,
         )
 
@@ -193,8 +213,12 @@ def _answer(question: Question) -> Mapping[str, Price]:
     slow = slow_processes(problem, question.name)
     loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
     least_cycles = slow.least_cycles(problem.pipeline.period_ms)
+    if question.misses is not None:
+        least_cycles = max(least_cycles, question.misses.least_cycles)
     least = SETTLING + math.ceil(least_cycles / problem.window_cycles)
     windows = min(_first_windows(problem, question.scenario), most)
+    if question.misses is not None:
+        windows = min(max(windows, least), most)
     if question.cycles is not None:
         windows = most
     elif loop is not None and (whole := SETTLING + math.ceil(FIRST / loop) * loop) <= most:
@@ -272,6 +296,7 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
     since = first * problem.window_cycles
     latency_ns, outcome = tables.latency_ns[0, since:], tables.outcome[0, since:]
     done, is_idle = outcome == CycleOutcome.DONE, outcome == CycleOutcome.IDLE
+    cap = problem.objective.caps.misses
     finished_ms = latency_ns[done] / 1e6
     usual_ms = float(np.median(finished_ms)) if len(finished_ms) else 0.0
     # A cycle that is unfinished and no older than usual may complete or not: it is left out.
@@ -306,7 +331,24 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         or (_is_settled(windows_ms, l95_error_ms) and _is_settled(rates, violation_error)),
         l95_deviation_ms=_deviation(windows_ms, l95_error_ms),
         violation_deviation=_deviation(rates, violation_error),
+        age=_age(player, name, windows, is_last=is_last) if problem.objective.weighs_age else None,
+        misses=None
+        if cap is None
+        else share_over(latency_ns[~is_idle] > problem.pipeline.deadline_ns, cap),
     )
+
+
+def _age(
+    player: CandidatePlayer, name: str, windows: PlayedWindows, *, is_last: bool
+) -> tuple[float, float]:
+    """Return the mean age of some windows of a candidate, and its standard error."""
+    ((problem, realisation),) = player.cells
+    age_ms, error_ms = mean_and_error(windows.age_ms)
+    if is_last:
+        slow = slow_processes(problem, realisation.scenario)
+        series = windows.age_ms, windows.violation_rate
+        error_ms, _ = slow.errors(problem, realisation, name, *series, (error_ms, 0.0))
+    return age_ms, error_ms
 
 
 def _deviation(windows: Floats, error: float) -> float:

@@ -99,7 +99,8 @@ class Profile(CellEstimator):
             # Checked once: only the shares of resources differ between windows.
             known = QoS(price.l95_ms, price.violation_rate, {}, price.uncut_l95_ms)
             metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
-            table.append((name, *metrics))
+            age = None if price.age is None else (price.age[0], 0.0)
+            table.append((name, *metrics, age, price.misses))
             work.append((name, tuple(price.own.items())))
         self._table, self._work = tuple(table), tuple(work)
         self.start(problem)
@@ -123,8 +124,8 @@ class Profile(CellEstimator):
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
         shares = self.with_work(self.see(observed, incumbent, own), self._work)
         return {
-            name: unchecked_qos(l95_ms, violation_rate, shares[name], cut_from_ms)
-            for name, l95_ms, violation_rate, cut_from_ms in self._table
+            name: unchecked_qos(l95_ms, rate, shares[name], cut_from_ms, None, age, misses)
+            for name, l95_ms, rate, cut_from_ms, age, misses in self._table
         }
 
     def see(self, observed: QoS, incumbent: str, own: Mapping[str, float]) -> Foreign:

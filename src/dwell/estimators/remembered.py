@@ -25,7 +25,7 @@ class Remembered(Generic[Asked, Answer]):
         return dict(self._known)
 
     def answer(self, question: Asked, find: Callable[[], Answer]) -> Answer:
-        """Return the known answer to a question, else find and keep it."""
+        """Return the answer to a question; find and keep it if it is unknown."""
         known = self._known.get(question)
         if known is None:
             known = find()

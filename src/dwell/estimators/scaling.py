@@ -37,7 +37,7 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part, Site, cores_of, message_of, sending_ns
 from dwell.estimators.paths import longest_path, steps_of
-from dwell.estimators.spans import NS_PER_MS, spans_ms
+from dwell.estimators.spans import NS_PER_MS, flow_patience_ns, spans_ms
 from dwell.model.bounds import VALUE, shown
 from dwell.model.number_arrays import Floats
 from dwell.model.order_statistic import percentile
@@ -88,6 +88,7 @@ class Scaling(Learning):
         self._steps = steps_of(problem.pipeline)
         names = list(problem.pipeline.tasks)
         self._sources = [names.index(flow.source) for flow in problem.pipeline.flows]
+        self._message_patience_ns = flow_patience_ns(problem)
         #: Longest known time of each task, alone on its node, milliseconds.
         self._longest: dict[Site, float] = {}
         self._active: Placement | None = None
@@ -117,7 +118,7 @@ class Scaling(Learning):
         alone_ms = np.where(work_ns >= 0, work_ns, np.nan) / cores / NS_PER_MS
         for column, task in enumerate(self.problem.pipeline.tasks):
             alone_ms[:, column] = self._filled(Site(task, active[task]), alone_ms[:, column])
-        limit_ns = evidence.close_ns - self._patience_ns
+        limit_ns = evidence.close_ns - self._message_patience_ns
         self._jobs = alone_ms
         sent_ns = cycles.end_ns[:, self._sources]
         self._messages = spans_ms(sent_ns, cycles.arrived_ns, limit_ns)
@@ -162,7 +163,7 @@ class Scaling(Learning):
         """Estimate every candidate's metrics (see `Estimator`)."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
         # With several rates the parts of one cycle show no bound on its latency.
-        has_path = not self.problem.pipeline.has_rates
+        has_path = not self.problem.pipeline.has_rates and self.problem.objective.latency is None
         if self._active is not None and len(self._jobs) and has_path:
             for name, placement in self.problem.candidates.items():
                 estimates[name] = self._at_least(estimates[name], placement, self._active)

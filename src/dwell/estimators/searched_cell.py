@@ -24,7 +24,7 @@ def searched(problem: Problem) -> Problem:
     Raises
     ------
     ProblemError
-        If no placement is feasible, with the reasons; or the cell has several rates.
+        If no placement is feasible, with the reasons.
     """
     every = problem.every_placement
     if every is None or every.is_found:

@@ -12,22 +12,43 @@ NS_PER_MS = 1e6
 PATIENCE = 2
 
 
-def patience_ns(problem: Problem) -> int:
+def patience_ns(problem: Problem, every: int = 1) -> int:
     """Return the age from which an unfinished job or message counts as lost at a window's end.
 
     The age is `PATIENCE` periods, but at most one period less than the window; D - P more if D is
     longer than P, because the window then ends later by as much.
+
+    A task that runs in each `every`-th cycle, and its messages, have `PATIENCE` times this
+    interval, but less than the age of the oldest run that each decision sees. If a decision may see one run
+    only, it is lost if it does not end within its interval, or by the next decision.
     """
     pipeline, periods = problem.pipeline, min(PATIENCE, problem.window_cycles - 1)
+    if every > 1:
+        seen = problem.decide_cycles
+        periods = min(PATIENCE * every, max(seen - every, min(seen, every) - 1))
     more_ns = max(pipeline.deadline_ns - pipeline.period_ns, 0)
     return round(periods * pipeline.period_ms * NS_PER_MS) + more_ns
 
 
-def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: int) -> Floats:
+def task_patience_ns(problem: Problem) -> Ints:
+    """Return the patience with the jobs of each task (see `patience_ns`)."""
+    rates = problem.pipeline.rates
+    return np.array(
+        [patience_ns(problem, rates[name]) for name in problem.pipeline.tasks], np.int64
+    )
+
+
+def flow_patience_ns(problem: Problem) -> Ints:
+    """Return the patience with the messages of each flow (see `patience_ns`)."""
+    rates = map(problem.pipeline.message_rate, problem.pipeline.flows)
+    return np.array([patience_ns(problem, rate) for rate in rates], np.int64)
+
+
+def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: Ints | int) -> Floats:
     """Return the durations between instants, milliseconds.
 
-    An instant in the future is -1. An unfinished job or message that began before `limit_ns` counts
-    as lost: its duration is infinite. Other unknown durations are NaN.
+    An instant in the future is -1. An unfinished job or message that began before `limit_ns`, which
+    may differ by column, counts as lost: its duration is infinite. Other unknown durations are NaN.
     """
     span: Floats = (end_ns - begin_ns) / NS_PER_MS
     open_ended = np.minimum(begin_ns, end_ns) < 0

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Collection, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
 from dwell.estimators.declared_cell import LONGEST_WINDOW, STEP, declared_of
@@ -19,12 +20,14 @@ from dwell.estimators.prices import SEED, prices_of
 from dwell.estimators.slow_processes import unseen_error
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays
+from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
 from dwell.model.qos import NO_ERROR, QoS, unchecked_qos
 from dwell.model.shadow_plan import ShadowFraction
+from dwell.model.stretches import share_over
 
 #: Most steps in a candidate's price; the same while the measured demands change.
 KEPT, RECENT = 24, 6
@@ -37,33 +40,47 @@ MOST_ALIKE = 0.9
 class _Twin:
     """The simulation of a candidate, and the results of its steps."""
 
-    def __init__(self, arrays: Arrays, resources: int) -> None:
+    def __init__(self, arrays: Arrays, resources: int, kept: int) -> None:
         self.arrays = arrays
         #: Next cycle to simulate.
         self.cursor = 0
         #: Means of each step, oldest first: L95 (ms) and V_D, each followed by the mean of the same
         #: windows as declared; uncut L95; the cell's own share of every resource.
-        self.steps = Steps(KEPT, PAIRS + 1 + resources)
+        self.steps = Steps(kept, PAIRS + 1 + resources)
+        #: Mean age of each step (ms), followed by its value as declared; then zeros.
+        self.ages = Steps(kept, PAIRS)
         #: Last cycle of each step, counted over all repetitions of the realisation.
-        self.ends: deque[int] = deque(maxlen=KEPT)
-        #: Latencies of the cycles of each step.
-        self.latency_ns: deque[Ints] = deque(maxlen=KEPT)
+        self.ends: deque[int] = deque(maxlen=kept)
+        #: Latencies of the cycles of each step; which of the cycles with a sink missed.
+        self.latency_ns: deque[Ints] = deque(maxlen=kept)
+        self.missed: deque[NDArray[np.bool_]] = deque(maxlen=kept)
         self.price: QoS | None = None
         #: Whether the price's L95 and V_D are differences from the declared ones.
         self.is_relative = False, False
 
-    def add(self, means: Sequence[float], latency_ns: Ints, end: int) -> None:
-        """Add a step; drop the oldest beyond `KEPT`."""
+    def add(
+        self,
+        means: Sequence[float],
+        ages_ms: Sequence[float],
+        latency_ns: Ints,
+        missed: NDArray[np.bool_],
+        end: int,
+    ) -> None:
+        """Add a step; drop the oldest beyond the most."""
         self.steps.add(means)
+        self.ages.add(ages_ms)
         self.ends.append(end)
         self.latency_ns.append(latency_ns)
+        self.missed.append(missed)
 
     def keep(self, most: int) -> None:
         """Keep the newest `most` steps."""
         self.steps.keep(most)
+        self.ages.keep(most)
         while len(self.latency_ns) > most:
             self.latency_ns.popleft()
             self.ends.popleft()
+            self.missed.popleft()
 
 
 class StepwisePlayer:
@@ -80,7 +97,8 @@ class StepwisePlayer:
         self.problem, self._seed, self._shadow_fraction = problem, seed, shadow_fraction
         self.declared = declared_of(problem, seed, shadow_fraction)
         self.prices = prices_of(problem, shadow_fraction=shadow_fraction)
-        self._window = min(problem.window_cycles, LONGEST_WINDOW)
+        played = with_windows_up_to(LONGEST_WINDOW, problem)
+        self._window = played.window_cycles
         self._names, self._resources = tuple(problem.candidates), tuple(problem.fabric.resources)
         self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
         #: Standard deviations of a step's L95 (ms) and V_D, as declared.
@@ -92,8 +110,15 @@ class StepwisePlayer:
             for name in self._names
         }
         self.cycles = 0
+        self._misses = misses = problem.objective.caps.misses
+        self._deadline_ns = problem.pipeline.deadline_ns
+        #: Least number of steps with enough stretches for the cap on misses.
+        self._least = 0
+        if misses is not None:
+            self._least = 1 + -(-misses.least_cycles // (self._step * self._window))
+        self._kept = max(KEPT, self._least)
         self._player = CandidatePlayer(
-            [(with_windows_up_to(LONGEST_WINDOW, problem), self.declared.realisation)],
+            [(played, self.declared.realisation)],
             shadows=self.declared.shadows,
             measures=True,
         )
@@ -110,7 +135,7 @@ class StepwisePlayer:
         if not self._twins:
             first.tables.clock[0]["pauses"] = 1
             self._twins = {
-                name: _Twin(self._player.tables({0: name}), len(self._resources))
+                name: _Twin(self._player.tables({0: name}), len(self._resources), self._kept)
                 for name in self._names
             }
         for twin in self._twins.values():
@@ -130,8 +155,9 @@ class StepwisePlayer:
             since = max(twin.cursor for twin in self._twins.values())
             self._player.grow(present, since, self._offset)
             for name in names:
-                self._twins[name].keep(RECENT - 1)
-        for _ in range(steps):
+                self._twins[name].keep(max(RECENT, self._least) - 1)
+        fewest = min(len(self._twins[name].steps) for name in names)
+        for _ in range(max(steps, self._least - fewest)):
             last = max(self._twins[name].cursor for name in names)
             cycles = self.declared.realisation.cycles
             if last + self._step * self._window > cycles:
@@ -163,8 +189,12 @@ class StepwisePlayer:
                 _mean(windows.uncut_ms),
                 *_mean_shares(windows.shares[:, 1]),
             )
-            latency_ns = twin.arrays.tables.latency_ns[0, first * self._window : twin.cursor]
-            twin.add(means, latency_ns.copy(), self._offset + twin.cursor)
+            ages_ms = _mean(windows.age_ms), _mean(self.declared.age_ms[name][first:last]), 0, 0
+            cycles, tables = slice(first * self._window, twin.cursor), twin.arrays.tables
+            latency_ns = tables.latency_ns[0, cycles].copy()
+            due = tables.outcome[0, cycles] != CycleOutcome.IDLE
+            missed = latency_ns[due] > self._deadline_ns
+            twin.add(means, ages_ms, latency_ns, missed, self._offset + twin.cursor)
         twin.price = None
         self.cycles += self._step * self._window
 
@@ -237,17 +267,35 @@ class StepwisePlayer:
         l95_ms = min(l95_ms, self._censor_ms)
         uncut_ms = max(uncut / count, l95_ms)
         shares = [share / count for share in own]
+        age = None
+        if known.age is not None:
+            age = self._age(name, known.age)
         return unchecked_qos(
             l95_ms,
             min(violation_rate, 1.0),
             FrozenDict(zip(self._resources, shares, strict=True)),
             None if uncut_ms == l95_ms else uncut_ms,
             (l95_error_ms, violation_error),
+            age,
+            self._share_over(name),
         )
 
+    def _age(self, name: str, known: tuple[float, float]) -> tuple[float, float]:
+        """Return the mean age of a candidate and its error, ms."""
+        steps = self._twins[name].ages
+        usual = float(self.declared.age_ms[name][1:].std()) / math.sqrt(self._step)
+        age_ms, error_ms, _ = _estimated(steps.sums()[0], len(steps), *known, usual=usual)
+        return min(age_ms, self._censor_ms), error_ms
+
+    def _share_over(self, name: str) -> float | None:
+        """Return the share of a candidate's stretches with more misses than the cap."""
+        if self._misses is None:
+            return None
+        return share_over(np.concatenate(self._twins[name].missed), self._misses)
+
     def is_full(self, name: str) -> bool:
-        """Whether a candidate's price has the most steps (`KEPT`)."""
-        return len(self._twins[name].steps) == KEPT
+        """Whether a candidate's price has the most steps."""
+        return len(self._twins[name].steps) == self._kept
 
 
 def _estimated(

@@ -213,6 +213,7 @@ class Arrays:
 #: Tables with rows by cell.
 BY_CELL = (
     *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome"),
+    *("actuated_ns", "actuated_from"),
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
 )
@@ -470,6 +471,7 @@ class _Layout:
         resources = problem.fabric.resources.values()
         flows = ordered_flows(pipeline)
         due_ns, grace_ns = close_after_ns(problem)
+        latency = problem.objective.latency
         self.end_ns = max(self.end_ns, int(release_ns[-1]) + grace_ns, int(release_ns[-2]) + due_ns)
         cell = {
             "release_ns": self._addresses(release_ns[None])[0],
@@ -497,6 +499,11 @@ class _Layout:
             "pair_0": len(self.shadow_parts),
             "resource_0": len(self.cell_servers),
             "n_resources": part.resources,
+            "n_flows": len(flows),
+            "chain_0": len(self.rows["chains"]),
+            "n_chains": len(pipeline.chains),
+            "latency_chain": -1 if latency is None else list(pipeline.chains).index(latency),
+            "weighs_age": problem.objective.weights.age > 0,
             "shadow": -1,
             "parent": -1,
         }
@@ -522,6 +529,10 @@ class _Layout:
         ]
         self.sampled += [
             flow_row[flow.source, flow.target] for flow in pipeline.flows if flow.sampled
+        ]
+        self.rows["chains"] += [
+            {"source": names.index(chain.source), "target": names.index(chain.target)}
+            for chain in pipeline.chains.values()
         ]
         rates, needed_by = pipeline.rates, pipeline.sink_rates
         for name, task in pipeline.tasks.items():
@@ -598,7 +609,7 @@ class _Layout:
         cells[part.row]["shadow"] = len(cells)
         # A shadow has no windows.
         shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
-        shadow["decide_cycles"] = 0
+        shadow["decide_cycles"] = shadow["n_chains"] = 0
         cells.append(cells[part.row] | shadow | {"shadow": -1, "parent": part.row})
         self.parts[index] = part._replace(rows=2)
         for node, kind in list(self.server_row):
@@ -758,6 +769,7 @@ class _Layout:
             for (_, real), every in zip(self.cells, self.decide_cycles, strict=True)
         )
         margin = 64 + sum(len(rows[name]) for name in ("sites", "flows", "tasks", "servers"))
+        chains = max(len(problem.pipeline.chains) for problem, _ in self.cells)
         n_layers = 1 + max((layer for known in self.layers for layer in known), default=0)
         clock = {
             "n_slots": slots,
@@ -766,7 +778,10 @@ class _Layout:
             "n_layers": n_layers,
             "n_resources": self.max_resources,
             "has_shared": len(self.cells) > 1 and bool(self.shared),
-            "has_rates": any(problem.pipeline.has_rates for problem, _ in self.cells),
+            "has_rates": any(
+                problem.pipeline.has_rates or problem.pipeline.chains for problem, _ in self.cells
+            ),
+            "n_chains": chains,
             "n_cycles": cycles,
             "n_windows": windows,
             "n_looks": looks,
@@ -809,6 +824,8 @@ class _Layout:
             "attempts": (cells * slots, max(self.max_flows, 1)),
             "own_ns": (cells, self.max_resources),
             "ages": max(problem.window_cycles for problem, _ in self.cells),
+            "origins": (cells, cycles, self.max_tasks, chains),
+            "actuated_from": (cells, chains, cycles),
             "shadow_bytes": (cells if self.shadows else 0, cycles),
             "log_outcome": logged * self.max_tasks,
         }
@@ -827,6 +844,7 @@ class _Layout:
             **{name: np.array(values, types[name]) for name, values in lists.items()},
             "changes": changes,
             "latency_ns": np.full((cells, cycles), NEVER_NS),
+            "actuated_ns": np.full((cells, chains, cycles), NEVER_NS),
             "log": _as_rows("log", np.full((logged * self.max_tasks, 6), -1)),
             "log_arrived": np.full((logged, self.max_flows), -1),
             "log_taken": np.full((logged if clock["has_rates"] else 0, self.max_flows), -1),
@@ -885,13 +903,18 @@ class _Layout:
 
 
 def back_ns(problem: Problem, placement: Placement) -> int:
-    """Time from a completion until the guard learns of it, nanoseconds.
-
-    A completion is a small message on the shortest path of links. The time is the least sum of mean
-    delays from the node of a sink to the stamper's node, for the farthest sink; 0 without a path.
-    """
-    pipeline, links = problem.pipeline, problem.fabric.links.values()
+    """Time from a completion until the guard learns of it, of the farthest sink, nanoseconds."""
+    pipeline = problem.pipeline
     sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
+    return way_back_ns(problem, sinks)
+
+
+def way_back_ns(problem: Problem, from_nodes: Collection[str]) -> int:
+    """Longest time that a small message takes from some nodes to the guard, nanoseconds.
+
+    The time is the least sum of mean delays of links to the stamper's node; 0 without a path.
+    """
+    links = problem.fabric.links.values()
     to_ms = {problem.stamper_node: 0.0}
     reached = [(0.0, problem.stamper_node)]
     while reached:
@@ -901,7 +924,7 @@ def back_ns(problem: Problem, placement: Placement) -> int:
             if link.target == node and further_ms < to_ms.get(link.source, np.inf):
                 to_ms[link.source] = further_ms
                 heapq.heappush(reached, (further_ms, link.source))
-    return round(max(to_ms.get(node, 0.0) for node in sinks) * 1e6)
+    return round(max(to_ms.get(node, 0.0) for node in from_nodes) * 1e6)
 
 
 def ordered_flows(pipeline: Pipeline) -> list[Flow]:

@@ -1,9 +1,9 @@
 // The events of a cycle: release, inputs, workers, completion, loss.
 #pragma once
 
+#include "chains.h"
 #include "links.h"
 #include "remainders.h"
-#include "samples.h"
 
 namespace dwell {
 
@@ -270,6 +270,7 @@ void complete(S& s, i64 key, i64 now) {
   s.own_ns[site.own] += static_cast<f64>(site.threads) * static_cast<f64>(site.exec_ns[cycle]);
   job.compute_ns += now - job.started_ns;
   log_job(s, cell, cycle, task, job, kDone, now);
+  if (S::kRates) actuate(s, cell, cycle, task, now);
   free_worker(s, site);
   if (s.task(cell, task).n_out == 0) {
     finish(s, cell, cycle, task, job, now);
@@ -423,7 +424,10 @@ void settle(S& s, i64 now) {
     const i64 key = s.ready[i];
     const i64 job = key & ~kTaken;
     if (key & kTaken || become_ready(s, cell_of(job), cycle_of(job), item_of(job), now)) {
-      if (S::kRates) take_values(s, job);
+      if (S::kRates) {
+        take_values(s, job);
+        descend(s, job);
+      }
       admit(s, job, now);
     }
   }

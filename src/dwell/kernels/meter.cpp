@@ -121,20 +121,21 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
       const i64 part = parts[column], flow = column - n_tasks;
       if (part < 0) continue;
       const i64 source = flow < 0 ? 0 : layout->sources[flow];
+      const i64 lost_ns = limit_ns - (found->more_ns == nullptr ? 0 : found->more_ns[part]);
       for (i64 i = 0; i < window->n; ++i) {
         const i64* cycle = window->rows + i * window->width;
         if (cycle[0] != active || (begin > 0 && cycle[begin] != other)) continue;
         const i64 *ready_ns = cycle + begin + 1, *end_ns = ready_ns + n_tasks;
         const i64 *arrived_ns = end_ns + n_tasks, *work_ns = arrived_ns + n_flows;
         if (flow < 0 && found->cost == nullptr) {
-          add_span(*found, part, ready_ns[column], end_ns[column], limit_ns);
+          add_span(*found, part, ready_ns[column], end_ns[column], lost_ns);
         } else if (flow < 0) {
           const bool is_known = end_ns[column] >= 0 && work_ns[column] >= 0;
           const f64 cost = found->cost[part];
           if (is_known) add(*found, part, static_cast<f64>(work_ns[column]) * cost / 1e6);
         } else {
           const i64 sent_ns = (shared[flow] ? cycle + 1 + n_tasks : end_ns)[source];
-          const bool has_come = add_span(*found, part, sent_ns, arrived_ns[flow], limit_ns);
+          const bool has_come = add_span(*found, part, sent_ns, arrived_ns[flow], lost_ns);
           if (found->cost == nullptr || found->link[part] < 0 || sent_ns < 0) continue;
           // A lost message may never have occupied the link.
           if (!has_come) continue;

@@ -151,6 +151,9 @@ class PartTimes:
         Number of the link of a message, if messages wait there; -1 for none.
     repeats : int64 array, shape (parts,), optional
         1 for messages of links that repeat what is lost and keep the order, else 0.
+    more_ns : int64 array, shape (parts,), optional
+        Time by which each part may begin before the limit of a window (see `begin`) without being
+        lost.
 
     Raises
     ------
@@ -164,9 +167,10 @@ class PartTimes:
         cost: Floats | None = None,
         link: Ints | None = None,
         repeats: Ints | None = None,
+        more_ns: Ints | None = None,
     ) -> None:
         self._meter = _meter()
-        self._cost, self._link, self._repeats = cost, link, repeats
+        self._cost, self._link, self._repeats, self._more_ns = cost, link, repeats, more_ns
         self._count, self._order = np.zeros((2, parts), np.int64)
         #: The kernel's row of the times found.
         self.found = structs()["Found"]()
@@ -174,13 +178,14 @@ class PartTimes:
         if cost is not None and link is not None and repeats is not None:
             self.found.cost, self.found.link = cost.ctypes.data, link.ctypes.data
             self.found.repeats = repeats.ctypes.data
+        if more_ns is not None:
+            self.found.more_ns = more_ns.ctypes.data
         self._ms, self._crossings = np.empty((parts, 0)), np.empty(0, np.int64)
 
-    def __reduce__(
-        self,
-    ) -> tuple[type[PartTimes], tuple[int, Floats | None, Ints | None, Ints | None]]:
+    def __reduce__(self) -> tuple[type[PartTimes], tuple[int | Floats | Ints | None, ...]]:
         # A copy has its own addresses, and starts without times.
-        return PartTimes, (len(self._count), self._cost, self._link, self._repeats)
+        given = self._cost, self._link, self._repeats, self._more_ns
+        return PartTimes, (len(self._count), *given)
 
     def begin(self, window: WindowRows, limit_ns: int) -> None:
         """Begin a window; this overwrites the times of the previous window.
@@ -188,7 +193,8 @@ class PartTimes:
         Parameters
         ----------
         limit_ns : int
-            A job or message that began before this, and has not ended, counts as lost.
+            A job or message that began before this, and has not ended, counts as lost; with
+            `more_ns` of its part, if it began earlier by as much.
         """
         self._window, self._limit_ns = window, limit_ns
         count, flows = len(window.table), window.flows

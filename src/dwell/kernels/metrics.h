@@ -10,6 +10,63 @@ namespace dwell {
 // Rank of L95 among n values: ceil(0.95 n).
 constexpr i64 l95_rank(i64 n) { return (19 * n + 19) / 20; }
 
+// L95 of the data ages of a window's actuations up to now, in place of L95 of latencies.
+template <class S>
+[[gnu::noinline]] void measure_chain(S& s, i64 cell, i64 now, Seen& seen) {
+  const Cell& of = s.cell(cell);
+  const i64 row = s.actuation(cell, of.latency_chain, seen.first_cycle);
+  i64 known = 0;
+  for (i64 i = 0; i < seen.cycles; ++i) {
+    const i64 at_ns = s.actuated_ns[row + i];
+    if (at_ns <= now) s.ages[known++] = at_ns - of.release_ns[s.actuated_from[row + i]];
+  }
+  seen.uncut_ms = std::numeric_limits<f64>::infinity();
+  if (known > 0) {
+    i64* ages = s.ages.rows;
+    const i64 rank = l95_rank(known);
+    std::nth_element(ages, ages + rank - 1, ages + known);
+    seen.uncut_ms = static_cast<f64>(ages[rank - 1]) / 1e6;
+  }
+  seen.l95_ms = std::min(seen.uncut_ms, of.longest_ms);
+}
+
+// Integral of an age that grows from `from` to `until`, each at most `most`.
+inline f64 age_area(f64 from, f64 until, f64 most) {
+  const f64 turn = std::clamp(most, from, until);
+  return (from + turn) / 2 * (turn - from) + most * (until - turn);
+}
+
+// Mean over time, from the release of a cycle until now, of the age of the newest command, ms: of
+// the chain that counts as latency, else of cycles. A command that a newer one overtook has no
+// effect. Walks back from the newest cycle.
+template <class S>
+[[gnu::noinline]] f64 mean_age_ms(const S& s, i64 cell, i64 first, i64 now) {
+  const Cell& of = s.cell(cell);
+  const bool of_chain = S::kRates && of.latency_chain >= 0;
+  const f64 most_ns = of.longest_ms * 1e6;
+  const i64 begin_ns = of.release_ns[first];
+  const auto add = [&](i64 from_ns, i64 until_ns, i64 origin) {
+    const i64 born_ns = of.release_ns[origin];
+    return age_area(static_cast<f64>(from_ns - born_ns), static_cast<f64>(until_ns - born_ns),
+                    most_ns);
+  };
+  f64 area = 0.0;
+  i64 until_ns = now, cycle = of.released - 1;
+  for (; cycle >= 0 && until_ns > begin_ns; --cycle) {
+    // All older commands count with the largest age.
+    if (static_cast<f64>(begin_ns - of.release_ns[cycle]) >= most_ns) break;
+    const i64 row = of_chain ? s.actuation(cell, of.latency_chain, cycle) : s.output(cell, cycle);
+    const i64 at_ns =
+        of_chain ? s.actuated_ns[row] : later(of.release_ns[cycle], s.latency_ns[row]);
+    if (at_ns >= until_ns) continue;
+    const i64 from_ns = std::max(at_ns, begin_ns);
+    area += add(from_ns, until_ns, of_chain ? s.actuated_from[row] : cycle);
+    until_ns = from_ns;
+  }
+  if (until_ns > begin_ns) area += add(begin_ns, until_ns, 0);
+  return area / static_cast<f64>(now - begin_ns) / 1e6;
+}
+
 // Whether the value at the rank of L95 is the age of an unfinished cycle; between equal values,
 // latencies precede ages.
 template <class S>
@@ -26,9 +83,9 @@ bool is_age(const S& s, i64 cell, i64 first, i64 n, i64 rank, i64 value, i64 now
   return before < rank;
 }
 
-// Metrics of `n` cycles as known now.
+// Misses and L95 of `n` cycles as known now.
 template <class S>
-[[gnu::noinline]] Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
+[[gnu::noinline]] Seen measure_cycles(S& s, i64 cell, i64 first, i64 n, i64 now) {
   const Cell& of = s.cell(cell);
   const i64 row = s.output(cell, first);
   i64 missed = 0, unfinished = 0, counted = 0;
@@ -41,7 +98,7 @@ template <class S>
     s.ages[S::kRates ? counted++ : i] = std::min(latency_ns, age_ns);
   }
   if (!S::kRates) counted = n;
-  if (counted == 0) return Seen{first, n, 0, 0, 0.0, 0.0};
+  if (counted == 0) return Seen{first, n, 0, 0, 0.0, 0.0, 0.0};
   const i64 rank = l95_rank(counted);
   i64* ages = s.ages.rows;
   std::nth_element(ages, ages + rank - 1, ages + counted);
@@ -53,7 +110,18 @@ template <class S>
               missed,
               counted,
               std::min(l95_ms, of.longest_ms),
-              lost ? std::numeric_limits<f64>::infinity() : l95_ms};
+              lost ? std::numeric_limits<f64>::infinity() : l95_ms,
+              0.0};
+}
+
+// Metrics of `n` cycles as known now.
+template <class S>
+Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
+  const Cell& of = s.cell(cell);
+  Seen seen = measure_cycles(s, cell, first, n, now);
+  if (S::kRates && of.latency_chain >= 0) measure_chain(s, cell, now, seen);
+  if (of.weighs_age != 0) seen.age_ms = mean_age_ms(s, cell, first, now);
+  return seen;
 }
 
 // Writes the used share of each resource from the release of a cycle until now.

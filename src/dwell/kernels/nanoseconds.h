@@ -12,7 +12,7 @@ constexpr double kHorizonNs = 9.2e18;
 
 // Rounds half to even; from 0 to 2^63.
 inline int64_t round_ns(double ns) noexcept {
-  // The sum has no room for a fraction, and from 2^52 on a double has none.
+  // A double from 2^52 on has no fraction, so adding 2^52 rounds.
   return static_cast<int64_t>(ns < 0x1p52 ? (ns + 0x1p52) - 0x1p52 : ns);
 }
 

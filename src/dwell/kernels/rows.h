@@ -43,9 +43,10 @@ struct Crossing;  // of meter.cpp
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
   field(i64, has_shared) /* whether cells have servers in common */                              \
-  field(i64, has_rates) /* whether some tasks skip cycles, or flows are sampled */               \
+  field(i64, has_rates) /* whether tasks skip cycles, flows are sampled, or chains exist */      \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
   field(i64, n_priced) /* columns of the outputs */                                              \
+  field(i64, n_chains) /* of a cell */                                                           \
   field(i64, margin) field(i64, budget)                                                          \
   field(i64, logs_all) /* whether logs keep all cycles, or only the ring's */                    \
   field(i64, n_events) field(i64, first_event) field(i64, used_events) field(i64, free_event)    \
@@ -60,10 +61,12 @@ struct Crossing;  // of meter.cpp
 
 // A window ends `due_ns` after the release of its last cycle, or `grace_ns` after the release of
 // the next cycle, whichever is later. `wakes_ns` is the instant at which the guard is woken unless
-// it learns before that a cycle from `waited` on has completed. `patience_ns` is the guard's.
+// it learns before that a cycle from `waited` on has completed, or until `chain_due_ns`, at which
+// the patience for a chain may end. `patience_ns` is the guard's for cycles.
 // `decide_cycles` is the number of cycles between decisions that are more frequent than windows; 0
 // for one decision per window. The next decision looks at cycles before `look_cycle`. `since` is
 // the first cycle under the placement in force, and `look_0` the first decision after it.
+// `latency_chain` is the chain whose data age counts as latency, -1 for none.
 #define DWELL_CELL(field)                                                                        \
   field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
   field(i64, n_cycles) field(i64, window) field(i64, window_first) field(i64, close_cycle)       \
@@ -71,7 +74,7 @@ struct Crossing;  // of meter.cpp
   field(i64, decide_cycles) field(i64, since) field(i64, look_0) field(i64, look)                \
   field(i64, look_cycle) field(i64, look_pending)                                                \
   field(i64, deadline_ns) field(f64, longest_ms) /* larger latencies count as this */            \
-  field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited)                                \
+  field(i64, wakes_ns) field(i64, patience_ns) field(i64, waited) field(i64, chain_due_ns)       \
   field(i64, period_ns) field(i64, released) /* cycles */                                        \
   field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
@@ -79,7 +82,12 @@ struct Crossing;  // of meter.cpp
   field(i32, sampled_0) field(i32, n_sampled) /* in `sampled` */                                 \
   field(i32, forward_0) field(i32, n_forwards) /* in `forwards` */                               \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
+  field(i32, n_flows) field(i32, chain_0) field(i32, n_chains) /* in `chains` */                 \
+  field(i32, latency_chain) field(i32, weighs_age) /* whether `Seen` needs ages */               \
   field(i32, shadow) field(i32, parent)
+
+// A chain of tasks; `last` is the origin of its last actuation.
+#define DWELL_CHAIN(field) field(i64, source) field(i64, target) field(i64, last)
 
 // A task runs in every `every`-th cycle from 0 on. `n_in` counts its waited inputs. The rates of
 // the sinks to which waited flows lead from it, its own if it is a sink, are in `sink_rates`.
@@ -197,10 +205,11 @@ struct Crossing;  // of meter.cpp
   field(i64, used_ns) field(i64, above_ns)
 
 // Metrics of cycles as known at the end of a window, or when a decision was due. `counted` cycles
-// are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell.
+// are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell. `age_ms` is the mean
+// over time of the age of the newest command, 0 unless the cell `weighs_age`.
 #define DWELL_SEEN(field)                                                                        \
   field(i64, first_cycle) field(i64, cycles) field(i64, missed) field(i64, counted)              \
-  field(f64, l95_ms) field(f64, uncut_ms)
+  field(f64, l95_ms) field(f64, uncut_ms) field(f64, age_ms)
 
 // Numbers by which a built-in policy with the estimator `profile` decides (rules.h): the policy's
 // parameters and the objective's, the placements of the cell, and the sums of `ATP` since its last
@@ -286,6 +295,7 @@ struct Crossing;  // of meter.cpp
 #define DWELL_FOUND(field)                                                                       \
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
+  field(const i64*, more_ns) /* patience beyond the limit, null for none */                      \
   field(Crossing*, crossings) field(i64, n_crossings)
 
 // The values of a part from a single window: their number, and the sums of their places.
@@ -327,7 +337,7 @@ struct Crossing;  // of meter.cpp
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)                            \
   row(Link, DWELL_LINK) row(Held, DWELL_HELD)                                                    \
-  row(Forward, DWELL_FORWARD) row(Repeat, DWELL_REPEAT)                                          \
+  row(Forward, DWELL_FORWARD) row(Repeat, DWELL_REPEAT) row(Chain, DWELL_CHAIN)                  \
   row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                                              \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
@@ -365,9 +375,10 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
   table(f64, own_ns) table(i64, soonest_ns) table(i64, ages) table(i64, values)                  \
-  table(i64, forwarded)                                                                          \
+  table(i64, forwarded) table(Chain, chains) table(i32, origins)                                 \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
+  table(i64, actuated_ns) table(i64, actuated_from)                                              \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \
   table(Decided, decided) table(f64, priced)                                                     \

@@ -134,6 +134,8 @@ class Tables(NamedTuple):
     ages: Ints  # (W,) scratch: latency, or age if unfinished, of the cycles of a window
     values: Ints  # (sites, flows) cycle of the newest message of a sampled input; -1 for none
     forwarded: Ints  # (forwards,) newest cycle that was forwarded; -1 for none
+    chains: Rows  # chains of all cells
+    origins: NDArray[np.int32]  # (cells, N, tasks, chains) oldest cycle that a job descends from
     rule: Rows  # (1,), or empty if Python decides
     options: Rows  # (candidates,)
     shown: Floats  # (resources, candidates) last share under a candidate, kept while full; else 1
@@ -142,6 +144,8 @@ class Tables(NamedTuple):
     compute_ns: Ints
     network_ns: Ints
     outcome: NDArray[np.int8]
+    actuated_ns: Ints  # (cells, chains, N) completion of a chain's last task, or NEVER_NS
+    actuated_from: Ints  # (cells, chains, N) the origin of this actuation
     opened: Floats  # (cells, windows, PARTS, resources) at first releases
     closed: Floats  # (cells, windows, PARTS, resources) at the end of windows
     seen: Rows  # (cells, windows) metrics as known at the end of windows

@@ -165,6 +165,7 @@ DWELL_EXPORT int64_t dwell_follow(const double* measured_s, const double* actuat
     // The camera's measurement; its instant may be several holds earlier.
     const double at = measured_s[k];
     while (seen < k && actuated_s[seen] <= at) ++seen;
+    while (seen > 0 && actuated_s[seen - 1] > at) --seen;
     const double before = at - holds[seen].since;
     const SineCosine swing = sine_cosine(omega * at);
     const double error = amplitude * swing.sine - holds[seen].position_after(before);

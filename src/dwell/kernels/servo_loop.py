@@ -46,7 +46,7 @@ def follow(
     servo : Servo
         Plant, control law and target.
     measured_s, actuated_s : float64 array, shape (n,)
-        Instants of measurement and actuation of each command; both ascending, and no actuation
+        Instants of measurement and actuation of each command; actuations ascend, and none is
         before its measurement.
     begin_s, end_s : float
         Limits of the integrals.

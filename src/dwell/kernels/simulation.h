@@ -59,6 +59,16 @@ struct Simulation : Tables {
   i64 output(i64 cell, i64 cycle) const { return (kPlain ? 0 : cell * n_cycles) + cycle; }
   i16& stamp(i64 cell, i64 cycle) const { return stamps[output(cell, cycle)]; }
 
+  // Oldest cycle of a chain's first task from which a job descends.
+  i32& origin(i64 cell, i64 cycle, i64 task, i64 chain) const {
+    return origins[(output(cell, cycle) * n_tasks + task) * clock[0].n_chains + chain];
+  }
+
+  // Place of a cycle in the actuations of a chain.
+  i64 actuation(i64 cell, i64 chain, i64 cycle) const {
+    return ((kPlain ? 0 : cell * clock[0].n_chains) + chain) * n_cycles + cycle;
+  }
+
   // Place of a cycle in the logs.
   i64 log_row(i64 cell, i64 cycle) const {
     return clock[0].logs_all ? output(cell, cycle) : slot_row(cell, cycle);

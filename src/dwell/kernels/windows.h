@@ -147,14 +147,15 @@ void announce_look(S& s, i64 cell) {
 }
 
 // Whether the guard wakes now: it has learnt of no completion from cycle `waited` on, or the cycle
-// after the newest known completion is as old as the patience. If not, the check is repeated when
-// that cycle is.
+// after the newest known completion is as old as the patience, or the patience for a chain may have
+// ended. If not, the check is repeated when that cycle is that old, or for the chain.
 template <class S>
 bool wakes_guard(S& s, i64 cell, i64 now) {
   Cell& of = s.cell(cell);
   // The guard has changed the time of its wake.
   if (of.wakes_ns != now) return false;
   of.wakes_ns = -1;
+  if (of.chain_due_ns <= now) return true;
   const i64 waited = of.waited;
   for (i64 cycle = waited; cycle < of.n_cycles && of.release_ns[cycle] < now; ++cycle) {
     const i64 row = s.output(cell, cycle);
@@ -165,9 +166,12 @@ bool wakes_guard(S& s, i64 cell, i64 now) {
     }
   }
   if (of.waited == waited) return true;
-  if (of.waited >= of.n_cycles) return false;
-  const i64 due = later(of.release_ns[of.waited], of.patience_ns);
+  i64 due = of.chain_due_ns;
+  if (of.waited < of.n_cycles) {
+    due = std::min(due, later(of.release_ns[of.waited], of.patience_ns));
+  }
   if (due <= now) return true;
+  if (due >= kLastNs) return false;
   of.wakes_ns = due;
   s.post(due, make_key(kGuard, cell, 0, 0));
   return false;

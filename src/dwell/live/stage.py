@@ -8,10 +8,11 @@ import importlib
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 from dwell.errors import LiveError
+from dwell.model import FrozenDict
 
 __all__ = [
     "Actuator",
@@ -47,6 +48,9 @@ class Message:
     stamp_ns : int, optional
         Time at which a sensor took the frame, on any clock: set by a source, passed on by Dwell,
         and given to the actuator. Inputs of stages do not have it.
+    origins : mapping of str to int
+        Oldest cycles from which the message descends, by source task; only in a cell with sampled
+        flows or chains.
     """
 
     payload: Any = None
@@ -54,6 +58,7 @@ class Message:
     released_ns: int = 0
     age_ms: float = 0.0
     stamp_ns: int | None = None
+    origins: Mapping[str, int] = field(default_factory=FrozenDict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ from dwell.model.evolve import evolve
 from dwell.model.fabric import Bursts, Fabric, Link, Node, Quota
 from dwell.model.frozen import FrozenDict
 from dwell.model.live import Endpoint, Host, LiveSettings
-from dwell.model.objective import AIM, Caps, Objective, Targets, Tier, Weights
+from dwell.model.objective import AIM, Caps, MissCap, Objective, Targets, Tier, Weights
 from dwell.model.pipeline import Execution, Flow, Pipeline, Task
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -56,6 +56,7 @@ __all__ = [
     "LinkDisturbance",
     "LiveSettings",
     "LogNormal",
+    "MissCap",
     "MovingTarget",
     "Node",
     "NodeDisturbance",

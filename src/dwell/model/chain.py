@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 from dwell.errors import Fault
 from dwell.model.bounds import Bound
@@ -25,6 +26,13 @@ class Chain:
         default=math.inf,
         usual="none",
     )
+
+
+class ChainPatience(NamedTuple):
+    """Bound on the age of a chain's newest origin, ns, and the cycles between two origins."""
+
+    patience_ns: int
+    every: int
 
 
 def chain_faults(

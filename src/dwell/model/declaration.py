@@ -177,7 +177,7 @@ class DeclaredField(NamedTuple):
 
     @property
     def is_mapping(self) -> bool:
-        """Whether it holds values by name."""
+        """Whether the field is a mapping from names to values."""
         return get_origin(self.kind) is Mapping
 
 

@@ -36,7 +36,7 @@ class FleetEntry:
 
     cell: Problem
     count: int = key("How many cells of it there are.", COUNT, default=1)
-    scenario: str = key("What befalls them.", default="baseline")
+    scenario: str = key("Scenario of these cells.", default="baseline")
     policy: str | None = key("Their policy.", default=None, usual="the fleet's, or the cell's")
     estimator: str | None = key(
         "Their estimator.", default=None, usual="the fleet's, or the cell's"
@@ -260,9 +260,6 @@ def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -
             message = f"{cell.name!r} is the name of another cell, too; give it its own"
             yield Fault(f"cells[{place}].cell", message)
     for place, (_, cell) in enumerate(kinds):
-        if cell is not None and cell.pipeline.has_rates:
-            message = f"{cell.name} has `every` or `sampled`, which fleets do not support"
-            yield Fault(f"cells[{place}].cell", f"{message}; remove them, or simulate it alone")
         if cell is not None and cell.is_searched:
             message = f"{cell.name} has `candidates: all`, which fleets do not support"
             remedy = "paste the block of `dwell candidates CELL --yaml`"

@@ -84,13 +84,13 @@ class LiveSettings:
         "Age from which a command is not applied, ms; at least D.",
         Bound(0, LARGEST, above=True),
         default=None,
-        usual="max(2 P, D + P)",
+        usual="max(2 nP, D + nP) of a task that runs in every n-th cycle",
     )
     silence: Literal["hold", "zero"] = key(
         "Method of the actuator that is called without commands.", default="hold"
     )
     checkpoint_cycles: int = key(
-        "Cycles between copies of a task's state to its fallback; 0: none.",
+        "Runs of a task between copies of its state to its fallback; 0: none.",
         Bound(0, MAX_COUNT, whole=True),
         default=25,
     )

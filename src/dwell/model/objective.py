@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Literal, TypeAlias
 
 from dwell.errors import Fault, ProblemError
-from dwell.model.bounds import LARGEST, Bound
+from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
 from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
 
@@ -15,9 +15,11 @@ Tier: TypeAlias = Literal["robot", "edge", "cloud"]
 TIERS: tuple[Tier, ...] = ("robot", "edge", "cloud")
 #: Aim for a cell: a share of missed deadlines under 5 % (from the paper).
 AIM = 0.05
-
-
 #: The bounds keep J finite for any metrics.
+#: Longest stretch of a cap on misses: the longest simulation of a candidate has 20 of them.
+LONGEST_STRETCH = 4_000
+#: Largest share of stretches with too many misses.
+MISSES_SHARE = 0.01
 WEIGHT, TARGET, CAP = Bound(0, LARGEST), Bound(1e-9, LARGEST), Bound(0, above=True)
 
 
@@ -36,10 +38,16 @@ class Weights:
         default=None,
         usual="cloud nodes count as edge nodes",
     )
+    age: float = key(
+        "Weight of the mean age / target, of the chain `objective.latency`, else of cycles.",
+        WEIGHT,
+        default=0.0,
+        is_rare=True,
+    )
 
     def __post_init__(self) -> None:
         values = (self.latency, self.violations, self.robot, self.edge, self.switching, self.cloud)
-        if not any(values):
+        if not any((*values, self.age)):
             raise ProblemError(
                 [Fault("weights", "all weights are 0; at least one must be above 0")]
             )
@@ -55,6 +63,25 @@ class Targets:
     cloud: float | None = key(
         "Of cloud utilisation; needed where `weights` has `cloud`.", TARGET, default=None
     )
+    age_ms: float | None = key(
+        "Of the mean age, ms; needed where `weights` has `age`.", TARGET, default=None
+    )
+
+
+@declared("caps.misses")
+class MissCap:
+    """Cap on misses: more than m in at most 1 % of the stretches of k cycles."""
+
+    m: int = key("Misses that a stretch may have.", Bound(0, MAX_COUNT, whole=True))
+    k: int = key("Consecutive cycles of a stretch.", Bound(1, LONGEST_STRETCH, whole=True))
+
+    def __post_init__(self) -> None:
+        require(self.m < self.k, "caps.misses.m", self.m, f"below k = {self.k}")
+
+    @property
+    def least_cycles(self) -> int:
+        """Least number of simulated cycles of which the share of stretches is taken."""
+        return 20 * self.k
 
 
 @declared("caps")
@@ -66,6 +93,11 @@ class Caps:
         "On the utilisation of every node and accelerator, as 0.98.",
         CAP,
         default=math.inf,
+        usual="none",
+    )
+    misses: MissCap | None = key(
+        "On misses: more than m in at most 1 % of the stretches of k cycles.",
+        default=None,
         usual="none",
     )
 
@@ -89,9 +121,33 @@ class Objective:
         "measured utilisation.",
         default_factory=FrozenDict,
     )
+    latency: str | None = key(
+        "Chain whose data age counts as latency in J, caps and targets.",
+        default=None,
+        usual="the latency of cycles",
+        digested="decision",
+    )
 
     def __post_init__(self) -> None:
+        faults = []
         if self.weights.cloud is not None and self.targets.cloud is None:
-            raise ProblemError(
-                [Fault("targets.cloud", "missing; weights.cloud weighs cloud nodes apart")]
-            )
+            faults.append(Fault("targets.cloud", "missing; weights.cloud weighs cloud nodes apart"))
+        if self.weighs_age and self.targets.age_ms is None:
+            faults.append(Fault("targets.age_ms", "missing; weights.age weighs the mean age"))
+        if faults:
+            raise ProblemError(faults)
+
+    @property
+    def beyond_cycles(self) -> str:
+        """Path of the first key that needs more than latencies and V_D of windows; else empty."""
+        given = {
+            "latency": self.latency is not None,
+            "weights.age": self.weighs_age,
+            "caps.misses": self.caps.misses is not None,
+        }
+        return next((name for name, there in given.items() if there), "")
+
+    @property
+    def weighs_age(self) -> bool:
+        """Whether J has a term of the mean age."""
+        return self.weights.age > 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from dwell.model.bounds import LARGEST, MAX_COUNT, PERIOD_MS, TIME_MS, Bound, require
-from dwell.model.chain import Chain
+from dwell.model.chain import Chain, behind
 from dwell.model.declaration import declared, key
 from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
@@ -284,10 +284,28 @@ class Pipeline:
         return max(rates[name] for name in self.sinks)
 
     @property
+    def due_interval(self) -> int:
+        """Most cycles from a cycle in which a sink is due to the next such cycle."""
+        rates = self.rates
+        return min(rates[name] for name in self.sinks)
+
+    @property
     def has_idle_cycles(self) -> bool:
         """Whether no sink is due in some cycles."""
+        return self.due_interval > 1
+
+    def chain_cycles(self, chain: Chain) -> int:
+        """Cycles from one origin to the next that a chain's actuations may differ by.
+
+        This is the largest rate of the tasks on the ways from the chain's first task to its last.
+        """
+        on_ways = behind(chain.source, self.flows) | {chain.source}
         rates = self.rates
-        return min(rates[name] for name in self.sinks) > 1
+        return max(
+            rates[name]
+            for name in on_ways
+            if name == chain.target or chain.target in behind(name, self.flows)
+        )
 
     def message_rate(self, flow: Flow) -> int:
         """Cycles from one message of a flow to its next.

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from dwell.display import Displayed
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import MAX_COUNT, Bound, counted, require
+from dwell.model.chain import Chain, ChainPatience
 from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
 from dwell.model.every_placement import EveryPlacement
@@ -125,19 +126,19 @@ class Problem(Displayed):
         )
 
     def _require_due_sinks(self) -> None:
-        """Refuse windows in which a sink never runs, and features that do not support rates."""
+        """Refuse windows in which a sink never runs, and camera frames in cells with rates."""
         rates = self.pipeline.rates
         slowest = max(self.pipeline.sinks, key=lambda name: rates[name])
         bound = f"at least {rates[slowest]}, so that {slowest} runs in each window"
         holds = rates[slowest] <= self.window_cycles
         require(holds, "window_cycles", self.window_cycles, bound)
+        if (chain := self.latency_chain) is not None:
+            every, rate = self.decide_cycles, rates[chain.target]
+            bound = f"at least {rate}, the interval of {chain.target}, whose age objective.latency"
+            require(rate <= every, "controller.decide_cycles", every, f"{bound} names")
         framed = self.live.release == "frames" and max(rates.values()) > 1
         bound = "timer in a cell with `every`, because each frame releases a cycle"
         require(not framed, "live.release", self.live.release, bound)
-        names = list(self.controller.fallbacks)
-        guarded = bool(names) and self.pipeline.has_idle_cycles
-        bound = "empty, because the guard does not support cycles in which no sink runs"
-        require(not guarded, "controller.fallbacks", names, bound)
 
     def _unplaced(self) -> list[Fault]:
         """Return faults of placements without an anchored task, which only cell files may omit."""
@@ -168,6 +169,7 @@ class Problem(Displayed):
             controller=self.controller,
             tiers=self.objective.tiers,
             accelerators=self.objective.accelerators,
+            latency=self.objective.latency,
             live=self.live,
         )
 
@@ -232,6 +234,11 @@ class Problem(Displayed):
         return self.window_cycles * self.pipeline.period_ms
 
     @property
+    def due_cycles(self) -> int:
+        """Fewest cycles of a window in which a sink is due."""
+        return self.window_cycles // self.pipeline.due_interval
+
+    @property
     def window_ns(self) -> int:
         """Length of a window, nanoseconds."""
         return self.window_cycles * self.pipeline.period_ns
@@ -272,13 +279,24 @@ class Problem(Displayed):
         return (self.min_dwell_decisions + 1) * self.decide_cycles
 
     @property
+    def latency_chain(self) -> Chain | None:
+        """Chain whose data age counts as latency, if any."""
+        name = self.objective.latency
+        return None if name is None else self.pipeline.chains[name]
+
+    @property
     def censor_ms(self) -> float:
         """Largest latency in J: max(4 D, 2 P), at least L_max; J cuts longer latencies to it.
 
-        docs/concepts.md explains the reason.
+        If a chain's data age counts as latency: max(4 max_age, or 4 D without max_age, 2 n P), n
+        being the rate of the chain's last task. docs/concepts.md explains the reason.
         """
-        pipeline, cap_ms = self.pipeline, self.objective.caps.latency_ms
-        bound_ms = max(4 * pipeline.deadline_ms, 2 * pipeline.period_ms)
+        pipeline, cap_ms, chain = self.pipeline, self.objective.caps.latency_ms, self.latency_chain
+        usual_ms, every = pipeline.deadline_ms, 1
+        if chain is not None:
+            every = pipeline.rates[chain.target]
+            usual_ms = chain.max_age_ms if math.isfinite(chain.max_age_ms) else usual_ms
+        bound_ms = max(4 * usual_ms, 2 * every * pipeline.period_ms)
         return max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
 
     @property
@@ -307,19 +325,43 @@ class Problem(Displayed):
         """Node whose agent relays small messages if a direct link fails."""
         return self.live.relay or self.controller_node
 
-    @property
-    def max_age_ms(self) -> float:
-        """Largest age of a command that an actuator receives; by default max(2 P, D + P)."""
+    def max_age_ms(self, task: str) -> float:
+        """Return the largest age of a sink's commands, or of a source's frames.
+
+        By default max(2 nP, D + nP) for a task that runs in every n-th cycle.
+        """
         given_ms, pipeline = self.live.max_age_ms, self.pipeline
         if given_ms is not None:
             return given_ms
-        return max(2 * pipeline.period_ms, pipeline.deadline_ms + pipeline.period_ms)
+        interval_ms = pipeline.rates[task] * pipeline.period_ms
+        return max(2 * interval_ms, pipeline.deadline_ms + interval_ms)
 
     @property
     def guard_patience_ns(self) -> int:
         """Longest wait of the guard for a cycle after its release: max(D, P) + (g - 1) P."""
         pipeline, more = self.pipeline, self.controller.guard_cycles - 1
         return max(pipeline.deadline_ns, pipeline.period_ns) + more * pipeline.period_ns
+
+    @property
+    def chain_patiences(self) -> dict[str, ChainPatience]:
+        """Age of the newest origin at which the guard fires, of each chain with a `max_age_ms`.
+
+        It is max_age_ms + (g - 1) n P, where n is the interval between two origins that may differ.
+        """
+        pipeline, g = self.pipeline, self.controller.guard_cycles
+        rates, found = pipeline.rates, dict[str, ChainPatience]()
+        for name, chain in pipeline.chains.items():
+            if math.isfinite(chain.max_age_ms):
+                interval_ns = pipeline.chain_cycles(chain) * pipeline.period_ns
+                patience_ns = round(chain.max_age_ms * 1e6) + (g - 1) * interval_ns
+                found[name] = ChainPatience(patience_ns, rates[chain.source])
+        return found
+
+    @property
+    def longest_patience_ns(self) -> int:
+        """Longest wait of the guard, for a cycle or for a chain with a `max_age_ms`."""
+        chains = self.chain_patiences.values()
+        return max([self.guard_patience_ns, *(chain.patience_ns for chain in chains)])
 
     @property
     def stamper_node(self) -> str:

@@ -17,6 +17,8 @@ REASONS: tuple[Reason, ...] = get_args(Reason)
 INFINITY = math.inf
 #: Standard errors of L95 and V_D if a QoS has none.
 NO_ERROR = (0.0, 0.0)
+#: Mean age and its standard error if a QoS has none.
+NO_AGE: tuple[float | None, float] = (None, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +40,14 @@ class QoS:
     error : tuple of float, optional
         Standard errors of `l95_ms` (milliseconds) and of `violation_rate`; finite, at least 0.
         None if unknown, which counts as 0.
+    age_ms : float, optional
+        Mean over time of the age of the newest command, milliseconds; finite, at least 0. Needed if
+        J weighs ages.
+    age_error_ms : float, optional
+        Standard error of `age_ms`; finite, at least 0.
+    misses : float, optional
+        Share of the stretches of k cycles with more than m misses, in [0, 1] (``caps.misses``);
+        None if unknown, which respects the cap.
     paired : tuple of float, optional
         In a cell whose candidates come from a search: standard errors of the differences of
         `l95_ms` and `violation_rate` from the incumbent's estimates on the same samples.
@@ -53,6 +63,9 @@ class QoS:
     utilisation: Mapping[str, float]
     cut_from_ms: float | None = None
     error: tuple[float, float] | None = None
+    age_ms: float | None = None
+    age_error_ms: float = 0.0
+    misses: float | None = None
     paired: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
@@ -80,8 +93,18 @@ class QoS:
                     raise MetricError(
                         f"error of {metric} is {value!r}; it must be finite and at least 0"
                     )
+        for name, least in (("age_ms", self.age_ms), ("age_error_ms", self.age_error_ms)):
+            if least is not None and not 0 <= least < INFINITY:
+                raise MetricError(f"{name} is {least!r}; it must be finite and at least 0")
+        if self.misses is not None and not 0 <= self.misses <= 1:
+            raise MetricError(f"misses is {self.misses!r}; it must lie in [0, 1]")
         if type(self.utilisation) is not FrozenDict:
             object.__setattr__(self, "utilisation", FrozenDict(self.utilisation))
+
+    @property
+    def age(self) -> tuple[float, float] | None:
+        """The mean age and its standard error, milliseconds, if known."""
+        return None if self.age_ms is None else (self.age_ms, self.age_error_ms)
 
     @property
     def uncut_l95_ms(self) -> float:
@@ -89,9 +112,17 @@ class QoS:
         return self.l95_ms if self.cut_from_ms is None else self.cut_from_ms
 
 
-_set_l95_ms, _set_violation_rate, _set_utilisation, _set_cut_from_ms, _set_error, _set_paired = (
-    getattr(QoS, name).__set__ for name in QoS.__match_args__
-)
+(
+    _set_l95_ms,
+    _set_violation_rate,
+    _set_utilisation,
+    _set_cut_from_ms,
+    _set_error,
+    _set_age_ms,
+    _set_age_error_ms,
+    _set_misses,
+    _set_paired,
+) = (getattr(QoS, name).__set__ for name in QoS.__match_args__)
 
 
 def unchecked_qos(
@@ -100,12 +131,14 @@ def unchecked_qos(
     utilisation: Mapping[str, float],
     cut_from_ms: float | None,
     error: tuple[float, float] | None = None,
+    age: tuple[float, float] | None = None,
+    misses: float | None = None,
     paired: tuple[float, float] | None = None,
 ) -> QoS:
     """Make a QoS without checks, in a third of the time.
 
     The caller guarantees valid metrics and an immutable `utilisation`; `cut_from_ms` must be None
-    if it equals `l95_ms`.
+    if it equals `l95_ms`. `age` is `age_ms` and `age_error_ms`.
     """
     qos: QoS = object.__new__(QoS)
     _set_l95_ms(qos, l95_ms)
@@ -113,6 +146,10 @@ def unchecked_qos(
     _set_utilisation(qos, utilisation)
     _set_cut_from_ms(qos, cut_from_ms)
     _set_error(qos, error)
+    age_ms, age_error_ms = age or NO_AGE
+    _set_age_ms(qos, age_ms)
+    _set_age_error_ms(qos, age_error_ms)
+    _set_misses(qos, misses)
     _set_paired(qos, paired)
     return qos
 

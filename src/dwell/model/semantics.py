@@ -76,6 +76,7 @@ class CellParts:
     controller: ControllerSettings | None = None
     tiers: Mapping[str, Tier] = field(default_factory=dict)
     accelerators: Mapping[str, Tier] = field(default_factory=dict)
+    latency: str | None = None
     live: LiveSettings | None = None
 
 
@@ -183,7 +184,7 @@ def _names(parts: CellParts) -> Iterator[Fault]:
 
 
 def bad_name(name: str) -> str:
-    """Return what is wrong with a name, or nothing."""
+    """Return the fault of a name; empty if it has none."""
     if NAME.fullmatch(name) is not None and len(name) <= LONGEST_NAME:
         return ""
     rule = (
@@ -423,6 +424,8 @@ def _layers(parts: CellParts, items: Sequence[tuple[str, Disturbance]]) -> Itera
 
 
 def _objective(parts: CellParts) -> Iterator[Fault]:
+    if parts.latency is not None:
+        yield from _unknown("objective.latency", "chain", parts.latency, parts.chains)
     for name in parts.tiers:
         yield from _unknown(f"objective.tiers.{name}", "node", name, parts.nodes)
     counted = accelerator_tiers(parts.nodes, parts.tiers)

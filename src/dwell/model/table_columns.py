@@ -22,8 +22,11 @@ Kind: TypeAlias = Literal[
 ]
 #: Optional features of a run: `live` processes; shadows through alternatives (`shadows`); an
 #: estimator that reports samples and age of its estimates (`support`); a cell of a `fleet`;
-#: decisions between the ends of windows (`between`).
-Feature: TypeAlias = Literal["live", "shadows", "support", "fleet", "between"]
+#: decisions between the ends of windows (`between`); a weighed `age`; a cap on `misses`; a
+#: `chain` in place of the latency.
+Feature: TypeAlias = Literal[
+    "live", "shadows", "support", "fleet", "between", "age", "misses", "chain"
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,7 @@ class Column:
         Unit of a number; empty for a count, a share and a bare number.
     null : str
         When it is null, or NaN; empty if it never is.
-    of : tuple of {"live", "shadows", "support", "fleet", "between"}
+    of : tuple of `Feature`
         Features of which a run needs at least one to have the column; empty for all runs.
     is_new : bool
         Whether a run of this version of the schema may lack it.
@@ -92,7 +95,16 @@ SHADOWS: tuple[Feature, ...] = ("shadows",)
 SUPPORT: tuple[Feature, ...] = ("support",)
 FLEET: tuple[Feature, ...] = ("fleet",)
 BETWEEN: tuple[Feature, ...] = ("between",)
+AGE: tuple[Feature, ...] = ("age",)
+MISSES: tuple[Feature, ...] = ("misses",)
+CHAIN: tuple[Feature, ...] = ("chain",)
+UNACTUATED = "the chain did not actuate in the cycle"
 UNASKED = "the ledger was not asked"
+
+#: Columns of a study's tables with names in them: share of the windows that began under a
+#: candidate, mean utilisation of a resource, L95 of a chain's data age, and share over its bound.
+SHARE_OF, USE_OF = "share_{candidate}", "node_{resource}"
+AGE_OF, OVER_AGE_OF = "age_l95_{chain}", "age_missed_{chain}"
 
 CYCLES = (
     Column("cycle", "Int64", "Number of the cycle, from 0 without gaps."),
@@ -111,6 +123,15 @@ CYCLES = (
     Column("queue_ns", "Int64", "Part of the latency: waiting.", "ns", APART),
     Column("network_ns", "Int64", "Part of the latency: links.", "ns", APART),
     Column("lead", "Boolean", "Whether it belongs to no window."),
+    Column(
+        "chain_latency_ns",
+        "Int64",
+        "Release to the actuation of the chain `objective.latency`.",
+        "ns",
+        UNACTUATED,
+        CHAIN,
+    ),
+    Column("chain_age_ns", "Int64", "Data age at this actuation.", "ns", UNACTUATED, CHAIN),
     Column("run", "Int64", "Id of the run, as stamped.", of=LIVE),
     Column("number", "Int64", "Number of the cycle, as stamped.", of=LIVE),
     Column("term", "Int64", "Term of the order, as stamped.", of=LIVE),
@@ -160,15 +181,16 @@ WINDOWS = (
         "Utilisation of a resource, foreign work included.",
         null=UNMEASURED,
     ),
+    Column("seen_age_ms", "Float64", "Mean age up to the close, as in J.", "ms", UNSEEN, AGE),
     Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),
     Column(
-        "age_l95_{chain}",
+        AGE_OF,
         "Float64",
         "L95 of a chain's data age over the actuations of its cycles; infinite without any.",
         "ms",
     ),
     Column(
-        "age_missed_{chain}",
+        OVER_AGE_OF,
         "Float64",
         "Share of these actuations whose age is over `max_age_ms`; 1 without any.",
     ),
@@ -220,6 +242,7 @@ DECISIONS = (
         null=f"{GUARD}, or {UNMEASURED}",
         of=BETWEEN,
     ),
+    Column("seen_age_ms", "Float64", "Mean age since the first of them.", "ms", GUARD, AGE),
     Column(
         "j_{candidate}",
         "Float64",
@@ -240,6 +263,14 @@ DECISIONS = (
         "Float64",
         "Standard error of its estimated V_D; 0 in the same cases.",
         null=GUARD,
+    ),
+    Column("est_age_ms_{candidate}", "Float64", "Its estimated mean age.", "ms", GUARD, AGE),
+    Column(
+        "est_misses_{candidate}",
+        "Float64",
+        "Its estimated share of the stretches of k cycles with more than m misses.",
+        null=GUARD,
+        of=MISSES,
     ),
     Column(
         "est_u_{resource}_{candidate}",
@@ -348,16 +379,13 @@ TABLES: Mapping[str, TableSchema] = {
     "processes": TableSchema("a window and a process of a live cell", PROCESSES, on_request=True),
 }
 
-#: Columns of a study's tables with names in them: share of the windows that began under a
-#: candidate, and mean utilisation of a resource.
-SHARE_OF, USE_OF = "share_{candidate}", "node_{resource}"
 #: Suffixes of a column over seeds: its mean, and the ends of its interval.
 ENDS = ("", "_low", "_high")
 
 #: Names of the columns by table.
 TEMPLATES: Mapping[str, Sequence[str]] = {
     **{name: [column.name for column in table.columns] for name, table in TABLES.items()},
-    "runs": [of + end for of in (SHARE_OF, USE_OF) for end in ENDS],
+    "runs": [of + end for of in (SHARE_OF, USE_OF, AGE_OF, OVER_AGE_OF) for end in ENDS],
 }
 
 

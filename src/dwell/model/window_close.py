@@ -42,7 +42,7 @@ def window_close_ns(
 
 
 def close_after_ns(problem: Problem) -> tuple[int, int]:
-    """Return the least times to a window's close, from its last and from the next release."""
+    """Return the least time from a window's last release to its close, and from the next one."""
     # 28.6 ms are 28600000 ns, though their product in floating point may be a little less.
     due_ns = int(Decimal(str(problem.pipeline.deadline_ms)).scaleb(6))
     return due_ns, round(problem.controller.close_grace_ms * 1e6)

@@ -176,7 +176,7 @@ class ATP(ATPThresholds):
 
     def _shown(self, qos: QoS) -> _Shown:
         used = self._pricing.used(qos)
-        l95_error_ms, _ = margin_errors(qos, len(self.candidates))
+        l95_error_ms, *_ = margin_errors(qos, len(self.candidates))
         return _Shown(qos.l95_ms, l95_error_ms, used)
 
     def _error(self, shown: _Shown) -> float:

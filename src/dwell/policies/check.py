@@ -102,7 +102,7 @@ class _Check:
         self.faults: dict[str, str] = {}
 
     def note(self, kind: str, sentence: str) -> None:
-        """Keep the first sentence of each kind."""
+        """Record a fault, unless one of its kind is known."""
         self.faults.setdefault(kind, sentence)
 
     def stop(self, kind: str, sentence: str) -> NoReturn:

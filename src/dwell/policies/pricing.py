@@ -21,10 +21,11 @@ from dwell.cost import (
     margin_errors,
     price,
     tier_nodes,
+    weighed_age_ms,
 )
 from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
-from dwell.model.objective import Objective
+from dwell.model.objective import MISSES_SHARE, Objective
 from dwell.model.placement import Placement
 from dwell.model.qos import QoS, Reason
 
@@ -76,13 +77,13 @@ def _shares(
 class Pricing:
     """Prices the candidates of one policy."""
 
-    __slots__ = ("_cloud", "_edge", "_robot", "_rows", "candidates", "objective")
+    __slots__ = ("_cloud", "_edge", "_robot", "_rows", "_weighs_age", "candidates", "objective")
 
     def __init__(self, candidates: Mapping[str, Placement], objective: Objective) -> None:
         if not isinstance(objective, Objective):
             raise PolicyError(f"objective is {objective!r}; it must be an Objective")
         self.candidates = candidates
-        self.objective = objective
+        self.objective, self._weighs_age = objective, objective.weighs_age
         nodes = tier_nodes(objective)
         of = objective.accelerators
         self._robot, self._edge = _shares(nodes.robot, of), _shares(nodes.edge, of)
@@ -145,7 +146,7 @@ class Pricing:
         if one.error is None and other.error is None:
             return 0.0
         errors = (margin_errors(qos, len(self.candidates)) for qos in (one, other))
-        return margin(*(cost_error(error, self.objective) for error in errors))
+        return margin(*(cost_error((l95, rate), self.objective, age) for l95, rate, age in errors))
 
     def eligible(self, estimates: Mapping[str, QoS]) -> tuple[list[str], bool]:
         """Return the candidates to choose from, and whether they respect the caps.
@@ -156,10 +157,12 @@ class Pricing:
         """
         caps = self.objective.caps
         latency_ms, utilisation = caps.latency_ms, caps.utilisation
+        share = math.inf if caps.misses is None else MISSES_SHARE
         within = []
         for name in self.candidates:
             qos = estimates[name]
-            if qos.uncut_l95_ms <= latency_ms and busiest(qos) <= utilisation:
+            known = qos.misses is None or qos.misses <= share
+            if known and qos.uncut_l95_ms <= latency_ms and busiest(qos) <= utilisation:
                 within.append(name)
         if within:
             return within, True
@@ -186,6 +189,7 @@ class Pricing:
             0.0 if self._cloud is None else max(self._cloud(used)),
             switching,
             self.objective,
+            weighed_age_ms(qos, self.objective) if self._weighs_age else 0.0,
         )
 
     def _explain(self, qos: object, whose: str) -> NoReturn:

@@ -143,7 +143,7 @@ class WorkFunction(PricingPolicy):
         least = self._served * self._pricing.margin(estimates[best], estimates[now])
         here, there = self._index[now], self._index[best]
         saved = served[here] - served[there] - self._distances[here][there]
-        # Without errors a tie is a move.
+        # Without errors the margin is 0, and a tie moves.
         return least > 0 and not exceeds(saved, least)
 
     def _choose(self, served: list[float], eligible: list[str]) -> str:

@@ -200,7 +200,7 @@ def _place(known: Contended, variants: dict[str, int]) -> int:
 
 
 def _of_several(place: int) -> str:
-    """Return the colour for a place in the family that has the text's colour (DTP)."""
+    """Return the colour of a member, by its place, in the family of the text's colour (DTP)."""
     colours = (INK, *APART, MUTED)
     if place < len(BELIEFS):
         return colours[min(place, len(colours) - 1)]

@@ -39,7 +39,7 @@ from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
 #: Columns of the kernel's table `seen`.
-SEEN = "first_cycle", "cycles", "missed", "counted", "l95_ms", "uncut_ms"
+SEEN = "first_cycle", "cycles", "missed", "counted", "l95_ms", "uncut_ms", "age_ms"
 
 
 def simulate(
@@ -216,7 +216,7 @@ def play_cells(
     whole = lay_out(
         [(cell.problem, cell.realisation) for cell in cells],
         shared=shared,
-        log_jobs=jobs or any(cell.problem.pipeline.chains for cell in cells),
+        log_jobs=jobs,
         log_windows=any(cell.controller.learns for cell in cells),
         decides=True,
         shadows=[
@@ -440,13 +440,15 @@ class SimulatedStamper:
         if self.evidence is not None:
             first = boundary - self.every
             controller.learn(partial(self.evidence, first, boundary, close_ns))
-        _, _, missed, counted, l95_ms, uncut_ms = [column.item(0, index) for column in self.seen]
+        _, _, missed, counted, l95_ms, uncut_ms, age_ms = [
+            column.item(0, index) for column in self.seen
+        ]
         seen = l95_ms, missed / counted, uncut_ms
         shares = self.shares[0, index]
         if self.looks:
-            proposal = controller.propose_on(*seen, shares[1], recent=shares[0])
+            proposal = controller.propose_on(*seen, shares[1], recent=shares[0], age_ms=age_ms)
         else:
-            proposal = controller.propose_on(*seen, shares)
+            proposal = controller.propose_on(*seen, shares, age_ms=age_ms)
             self.metrics.append(proposal.seen)
         if watch is None or not self.course.by_guard:
             controller.commit(proposal)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dwell.control import CellGuard
 from dwell.control.guard import MOST_OPEN
 from dwell.kernels.advance import post_event
-from dwell.kernels.arrays import CellArrays
+from dwell.kernels.arrays import CellArrays, way_back_ns
 from dwell.kernels.codes import LAST_NS, EventKind
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Realisation
 from dwell.kernels.rows import Row
@@ -44,6 +44,7 @@ class SimulatedGuard:
         # knows, and the instant of its last update.
         self._probes = np.full(self.cycles, -1, np.int16)
         self._probed, self._probed_ns = 0, -1
+        self._chains = {name: _Actuations(problem, arrays, name) for name in self.guard.chains}
         self._cell["patience_ns"] = min(self.guard.patience_ns, HORIZON_NS)
         self._arm(-1)
 
@@ -89,13 +90,21 @@ class SimulatedGuard:
             parts.update(*(guard.presence.parts[name] for name in guard.options))
             instants += [up for part in parts for _, up in self._outages[part]]
         self._cell["waited"] = min(guard.waits_for, self.cycles)
+        chain_dues = [
+            self._due_ns(cycle, patience_ns)
+            for waits_for, patience_ns in guard.chain_waits
+            for cycle in (waits_for, self._moved)
+        ]
+        self._cell["chain_due_ns"] = min((at for at in chain_dues if at > now), default=LAST_NS)
+        instants += chain_dues
         self._wake_at(min((at for at in instants if at > now), default=LAST_NS))
 
-    def _due_ns(self, cycle: int) -> int:
-        """Return the instant at which a cycle is as old as the guard's patience."""
+    def _due_ns(self, cycle: int, patience_ns: int | None = None) -> int:
+        """Return the instant at which a cycle is as old as a patience, by default for cycles."""
         if cycle >= self.cycles:
             return LAST_NS
-        return min(int(self.release_ns[cycle]) + self.guard.patience_ns, LAST_NS)
+        patience_ns = self.guard.patience_ns if patience_ns is None else patience_ns
+        return min(int(self.release_ns[cycle]) + patience_ns, LAST_NS)
 
     def _wake_at(self, at_ns: int) -> None:
         """Replace the next wake-up."""
@@ -113,9 +122,12 @@ class SimulatedGuard:
         self._moved = first
         cell = self._cell
         cell["waited"] = min(cell["waited"], first)
+        chain_dues = [self._due_ns(first, patience_ns) for _, patience_ns in self.guard.chain_waits]
+        cell["chain_due_ns"] = min([int(cell["chain_due_ns"]), *chain_dues])
         # The new placement may have other fallbacks.
-        if self._due_ns(first) < cell["wakes_ns"]:
-            self._wake_at(self._due_ns(first))
+        due_ns = min([self._due_ns(first), *chain_dues])
+        if due_ns < cell["wakes_ns"]:
+            self._wake_at(due_ns)
 
     # -------------------------------------------------------------------------- telling
 
@@ -145,7 +157,11 @@ class SimulatedGuard:
         """
         guard = self.guard
         stop = self._released(now)
-        first = self._first_to_tell(stop, now)
+        origins = {
+            name: chain.origins(self._told_ns, now, stop) for name, chain in self._chains.items()
+        }
+        newest = [max(found, default=-1) for found in origins.values()]
+        first = min([self._first_to_tell(stop, now), *(max(one, self._told) for one in newest)])
         guard.passed(max(first - self._told, 0))
         stamps = self._sent(first, stop)
         for cycle in range(max(first, self._told), stop):
@@ -162,6 +178,9 @@ class SimulatedGuard:
                 guard.arrived(cycle, now, self.names[code])
             elif code >= 0:
                 guard.failures.completed(self.names[code], cycle)
+        for name, found in origins.items():
+            for origin in found:
+                guard.acted(name, origin, self.names[self.arrays.tables.stamps[0, origin]])
         self._told, self._told_ns = stop, now
 
     def _first_to_tell(self, stop: int, now: int) -> int:
@@ -295,6 +314,40 @@ class SimulatedGuard:
                 row = _row(nodes.nodes, node or part)
                 changes = nodes.table[:, [0, 3]][nodes.table[:, 1] == row]
             found[part] = _outages(changes, round(start_ms * 1e6))
+        return found
+
+
+class _Actuations:
+    """Actuations of a guarded chain, when the guard learns of them."""
+
+    def __init__(self, problem: Problem, arrays: CellArrays, name: str) -> None:
+        pipeline, self._arrays = problem.pipeline, arrays
+        self._row, target = list(pipeline.chains).index(name), pipeline.chains[name].target
+        placed = problem.candidates.values()
+        self._back_ns = np.array([way_back_ns(problem, {one[target]}) for one in placed])
+        # First cycle whose actuation the guard may not know yet.
+        self._first = 0
+
+    def origins(self, after: int, now: int, stop: int) -> list[int]:
+        """Return the origins that the guard learns of after an instant until now.
+
+        Parameters
+        ----------
+        stop : int
+            Number of released cycles.
+        """
+        tables, cycles = self._arrays.tables, slice(self._first, stop)
+        at_ns = tables.actuated_ns[0, self._row, cycles]
+        heard_ns = np.where(
+            at_ns < NEVER_NS, at_ns + self._back_ns[tables.stamps[0, cycles]], NEVER_NS
+        )
+        new = (heard_ns > after) & (heard_ns <= now)
+        found: list[int] = np.unique(tables.actuated_from[0, self._row, cycles][new]).tolist()
+        # Older cycles are over: the ring of the cycles in flight has other cycles in their places.
+        over = stop - int(self._arrays.whole.tables.clock[0]["n_slots"])
+        known = np.arange(self._first, stop) < over
+        open_ = np.flatnonzero(~((heard_ns <= now) | (known & (at_ns == NEVER_NS))))
+        self._first += int(open_[0]) if len(open_) else len(known)
         return found
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, CellArrays, lay_out
+from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
@@ -25,8 +26,8 @@ class StaticRun(NamedTuple):
 
     Parameters
     ----------
-    missed : list of bool array, shape (cycles,)
-        Whether each cycle missed, by cell.
+    missed : list of bool array, shape (due cycles,)
+        Whether each cycle missed, by cell, without idle cycles.
     used : mapping of str to float
         Utilisation of the shared resources.
     """
@@ -144,8 +145,9 @@ def _result(
         problem, tables = cell.problem, arrays.tables
         width, closed = problem.window_cycles, int(tables.cells["window"][row])
         first, last = problem.warmup_windows, closed
-        latency_ns = tables.latency_ns[row, first * width : last * width]
-        missed.append(latency_ns > problem.pipeline.deadline_ns)
+        cycles = slice(first * width, last * width)
+        is_due = tables.outcome[row, cycles] != CycleOutcome.IDLE
+        missed.append(tables.latency_ns[row, cycles][is_due] > problem.pipeline.deadline_ns)
         if not used:
             shares = tables.shares[row, first:last, 0].mean(axis=0).tolist()
             resources = problem.fabric.resources.values()

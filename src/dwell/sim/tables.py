@@ -11,17 +11,26 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from dwell.control import Controller, final_l95_ms, moved_shares, overtaken_cycles, seen_costs
+from dwell.control import (
+    NO_AGE,
+    Controller,
+    age_l95_ms,
+    age_missed,
+    final_l95_ms,
+    moved_shares,
+    overtaken_cycles,
+    seen_costs,
+)
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
-from dwell.model import REASONS, Chain, Problem
+from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
-from dwell.sim.chain_ages import age_l95_ms, age_missed, chain_ages_ns
+from dwell.sim.chain_ages import chain_ages_ns
 
 if TYPE_CHECKING:
     import polars as pl
@@ -87,7 +96,12 @@ class PlayedRealisation:
     @property
     def features(self) -> tuple[Feature, ...]:
         """Optional features of the run, except the features of its estimator."""
-        return ("shadows",) if len(self.arrays.tables.cells) > 1 else ()
+        has: dict[Feature, bool] = {
+            "shadows": len(self.arrays.tables.cells) > 1,
+            "age": self.problem.objective.weighs_age,
+            "chain": self.problem.objective.latency is not None,
+        }
+        return tuple(feature for feature, there in has.items() if there)
 
     def by_window(self, cycles: NDArray[T]) -> NDArray[T]:
         """Return values of cycles by window, shape (windows, W); a view if `whole`."""
@@ -183,7 +197,8 @@ def make_tables(
             lambda: _decided_by_kernel(played) if played.by_kernel else _decisions(controller)
         ),
     }
-    features = {"windows": played.features, "decisions": controller.features}
+    features = dict.fromkeys(("cycles", "windows"), played.features)
+    features["decisions"] = controller.features
 
     def frame(name: str) -> pl.DataFrame:
         return frame_of(name, problem, arrays[name]().columns(), features.get(name, ()))
@@ -221,8 +236,28 @@ def _cycles(played: PlayedRealisation) -> TableArrays:
             "queue_ns": lambda: finished(latency - compute - network),
             "network_ns": lambda: finished(network),
             "lead": lambda: played.lead,
+            **_chain_columns(played),
         }
     )
+
+
+def _chain_columns(played: PlayedRealisation) -> dict[str, Callable[[], Ints]]:
+    """Return the latency and data age of each actuation of the chain in place of the latency."""
+    problem, count = played.problem, played.released
+    if problem.objective.latency is None:
+        return {}
+    number = list(problem.pipeline.chains).index(problem.objective.latency)
+    release_ns = played.realisation.release_ns[:count]
+    at_ns = played.arrays.tables.actuated_ns[0, number, :count]
+
+    def ages_ns() -> Ints:
+        ages = chain_ages_ns(played.realisation, played.arrays, number)[:count]
+        return np.where(ages == NO_AGE, NEVER_NS, ages)
+
+    return {
+        "chain_latency_ns": lambda: np.where(at_ns < NEVER_NS, at_ns - release_ns, NEVER_NS),
+        "chain_age_ns": ages_ns,
+    }
 
 
 def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
@@ -246,6 +281,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
+            **{name: values for name, values in seen.items() if name == "seen_age_ms"},
             "cost": seen["cost"],
             **_age_columns(played),
             "overtaken": lambda: played.by_window(played.overtaken).sum(axis=1),
@@ -266,8 +302,8 @@ def _final_l95_ms(played: PlayedRealisation) -> Floats:
 def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
     """Return the L95 of each chain's data age, and the share over its bound."""
     columns: dict[str, Callable[[], NDArray[np.generic]]] = {}
-    for name, chain in played.problem.pipeline.chains.items():
-        ages_ns = cache(partial(_ages_ns, played, chain))
+    for number, (name, chain) in enumerate(played.problem.pipeline.chains.items()):
+        ages_ns = cache(partial(_ages_ns, played, number))
         columns[f"age_l95_{name}"] = partial(_on_ages, ages_ns, age_l95_ms)
         over = partial(age_missed, max_age_ms=chain.max_age_ms)
         columns[f"age_missed_{name}"] = partial(_on_ages, ages_ns, over)
@@ -278,15 +314,14 @@ def _on_ages(ages_ns: Callable[[], Ints], metric: Callable[[Ints], Floats]) -> F
     return metric(ages_ns())
 
 
-def _ages_ns(played: PlayedRealisation, chain: Chain) -> Ints:
-    """Return a chain's data ages by window."""
-    pipeline, realisation = played.problem.pipeline, played.realisation
-    return played.by_window(chain_ages_ns(pipeline, chain, realisation, played.arrays))
+def _ages_ns(played: PlayedRealisation, number: int) -> Ints:
+    """Return the data ages of a chain by window."""
+    return played.by_window(chain_ages_ns(played.realisation, played.arrays, number))
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
     """Return the cost of shadows in each window: cycles sent twice, bytes, share of resources."""
-    if not played.features:
+    if "shadows" not in played.features:
         return {}
 
     def sent_bytes() -> Ints:
@@ -321,6 +356,9 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     else:
         metrics = np.array(played.metrics, np.float64).reshape(-1, 3)
         seen = dict(zip(("l95_ms", "violation_rate", "cost"), metrics.T, strict=True))
+    if played.problem.objective.weighs_age:
+        age_ms = np.where(np.isnan(seen["l95_ms"]), np.nan, played.seen["age_ms"])
+        seen["seen_age_ms"] = age_ms
     used = played.shares[:, 0]
     return seen | {f"u_{name}": used[:, i] for i, name in enumerate(played.controller.resources)}
 
@@ -337,7 +375,7 @@ def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
     moved[1:] = moved_shares(problem)[stamps[:-1], stamps[1:]]
     switching = played.by_window(moved).sum(axis=1)
     seen_of = seen["l95_ms"], seen["violation_rate"]
-    costs = seen_costs(problem, *seen_of, used, switching)
+    costs = seen_costs(problem, *seen_of, used, switching, played.seen["age_ms"])
     unseen = [played.host_down(at_ns) for at_ns in played.close_ns.tolist()]
     for values in (*seen.values(), costs):
         values[unseen] = np.nan

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.arrays import CellArrays, flow_rows
+from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 from dwell.model.number_arrays import Ints
@@ -25,8 +26,9 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     """
     tables, pipeline = arrays.tables, problem.pipeline
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
-    late_ns = tables.latency_ns[0, :last] > pipeline.deadline_ns
-    cycles = first + np.flatnonzero(late_ns[first:])
+    missed = tables.latency_ns[0, :last] > pipeline.deadline_ns
+    missed &= tables.outcome[0, :last] != CycleOutcome.IDLE
+    cycles = first + np.flatnonzero(missed[first:])
     logs, _, arrivals, _ = arrays.logs()
     log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_rows(pipeline)]
     stamps = tables.stamps[0, cycles]

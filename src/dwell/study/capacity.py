@@ -225,7 +225,8 @@ class FleetPlayer:
             cycles, windows = run.arrays("cycles"), run.arrays("windows")
             counts = ~windows["warmup"]
             first = int(windows["first_cycle"][counts][0])
-            missed.append(cycles["missed"][first:][~cycles["lead"][first:]])
+            is_due = ~cycles.names("outcome")[first:].equal("idle")
+            missed.append(cycles["missed"][first:][~cycles["lead"][first:] & is_due])
             if not used:
                 resources = run.problem.fabric.resources.values()
                 used = {
@@ -556,12 +557,15 @@ def _with_short_warmup(fleet: Fleet) -> Fleet:
 
 
 def _length(fleet: Fleet, cycles: int | None) -> tuple[Fleet, int]:
-    """Return the fleet to simulate and the length of a run: `cycles` of each cell, in windows."""
+    """Return the fleet to simulate and the length of a run.
+
+    The run has `cycles` of each cell in which a sink is due, in complete windows.
+    """
     if cycles is None and fleet.phases == "random" and fleet.is_static:
         fleet, cycles = _with_short_warmup(fleet), CYCLES_OF_A_DRAW
     needed = CYCLES if cycles is None else cycles
     cells = [entry.cell for entry in fleet.entries]
-    counted_ns = max(-(-needed // cell.window_cycles) * cell.window_ns for cell in cells)
+    counted_ns = max(-(-needed // cell.due_cycles) * cell.window_ns for cell in cells)
     return fleet, fleet.warmup_ns + counted_ns
 
 

@@ -67,12 +67,21 @@ class _Alone:
         }
 
 
-def require_sinks(problem: Problem, what: str) -> None:
-    """Raise a SimulationError if no sink is due in some cycles, which `what` does not support."""
+def require_supported(problem: Problem, what: str) -> None:
+    """Raise a SimulationError for cells that `what` does not support.
+
+    These are cells in which no sink is due in some cycles, and objectives with ages or a cap on
+    misses.
+    """
     if problem.pipeline.has_idle_cycles:
         raise SimulationError(
             f"{what} do not support cell {problem.name!r}, because no sink is due in some of its "
             "cycles; let a sink run in each cycle, or leave them out"
+        )
+    if name := problem.objective.beyond_cycles:
+        raise SimulationError(
+            f"{what} do not support objective.{name} of cell {problem.name!r}; remove it, or leave "
+            "them out"
         )
 
 
@@ -103,9 +112,9 @@ class Hindsight:
         Raises
         ------
         SimulationError
-            If the static run of a candidate is missing, or no sink is due in some cycles.
+            If the static run of a candidate is missing, or the cell is not supported.
         """
-        require_sinks(problem, "estimates in hindsight")
+        require_supported(problem, "estimates in hindsight")
         missing = [name for name in problem.candidates if name not in self._alone]
         if missing:
             raise SimulationError(

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from dwell.cost import hamming, price
+from dwell.errors import SimulationError
 from dwell.model import Problem
 from dwell.model.number_arrays import Floats
 from dwell.record import Names
@@ -39,8 +40,22 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
         switching = np.array([moved[at : at + width].sum() for at in first.tolist()])
     else:
         switching = _moves(windows.names("placement"), problem)
+    _require_same_latency(run, problem)
     l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
-    return price(l95_ms, rate, *tier_use(windows, problem), switching, problem.objective)
+    objective = problem.objective
+    age_ms = windows["seen_age_ms"] if objective.weighs_age else 0.0
+    return price(l95_ms, rate, *tier_use(windows, problem), switching, objective, age_ms)
+
+
+def _require_same_latency(run: Run, problem: Problem) -> None:
+    """Raise a SimulationError if the windows of a run lack metrics of a problem's objective."""
+    own, judge = run.problem.objective, problem.objective
+    if own.latency != judge.latency or (judge.weighs_age and not own.weighs_age):
+        raise SimulationError(
+            f"a run with objective.latency {own.latency} and weights.age {own.weights.age:g} has "
+            f"no J with {judge.latency} and {judge.weights.age:g}; give all policies the same "
+            "objective.latency, and a weights.age above 0 if any has one"
+        )
 
 
 def _moves(placed: Names, problem: Problem) -> Floats:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from dwell.display import Measure
-from dwell.model.table_columns import SHARE_OF, USE_OF
+from dwell.model.table_columns import AGE_OF, OVER_AGE_OF, SHARE_OF, USE_OF
 
 Better: TypeAlias = Literal["lower", "higher", ""]
 #: Values of a column, which determine its interval over seeds: `median` if they may be infinite,
@@ -42,7 +42,9 @@ class Metric(Measure):
         return f"{self.name}, {self.wording}" if self.wording else self.name
 
 
-#: All metrics by column; `SHARE_OF` and `USE_OF` have one column per placement and resource.
+#: Columns with the name of a placement, a resource or a chain in them.
+NAMED = (SHARE_OF, USE_OF, AGE_OF, OVER_AGE_OF)
+#: All metrics by column; those of `NAMED` have one column per name.
 METRICS: Mapping[str, Metric] = {
     metric.column: metric
     for metric in (
@@ -54,6 +56,9 @@ METRICS: Mapping[str, Metric] = {
         ),
         Metric("l95_ms", "L95", "ms", wording="mean of windows", values="positive"),
         Metric("cost", "J", decimals=2, wording="mean of windows", values="positive"),
+        Metric(AGE_OF, "age of {chain}", "ms", wording="L95, mean of windows", values="median"),
+        Metric(OVER_AGE_OF, "{chain} too old", "%", 100.0, wording="actuations", values="share"),
+        Metric("seen_age_ms", "age in J", "ms", wording="mean of windows", values="positive"),
         Metric("u_robot", "U_r", "%", 100.0, wording="busiest robot", values="positive"),
         Metric("u_edge", "U_e", "%", 100.0, wording="busiest edge node", values="positive"),
         Metric("migrations", "migrations", values="positive"),
@@ -98,12 +103,13 @@ def declared(column: str) -> Metric | None:
     """Return the declaration of a column, None for a user's own metric."""
     if column in METRICS:
         return METRICS[column]
-    for named in (SHARE_OF, USE_OF):
+    for named in NAMED:
         head = named.partition("{")[0]
         if column.startswith(head):
             name = column.removeprefix(head)
             metric = METRICS[named]
-            return metric.called(metric.name.format(candidate=name, resource=name), column)
+            called = metric.name.format(candidate=name, resource=name, chain=name)
+            return metric.called(called, column)
     return None
 
 

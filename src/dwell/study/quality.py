@@ -14,11 +14,9 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dwell.model import Servo
 from dwell.model.instants import NEVER_NS
@@ -36,7 +34,8 @@ class EffectiveCommands(NamedTuple):
     start_ns : int
         First release of the run. Information dates from it until the first actuation.
     release_ns, at_ns : int64 array, shape (n,)
-        Release of each command's cycle, and the instant at which the command took effect.
+        Release from which each command's information dates: of its cycle, or of the origin of a
+        chain's actuation; and the instant at which the command took effect.
     """
 
     start_ns: int
@@ -84,19 +83,22 @@ class TrackingError(NamedTuple):
         return self.iae_mm_s / self.seconds
 
 
-def actuations(release_ns: Ints, latency_ns: Ints) -> EffectiveCommands:
+def actuations(
+    release_ns: Ints, latency_ns: Ints, data_age_ns: Ints | None = None
+) -> EffectiveCommands:
     """Return the commands that take effect: no newer command completes before or with them.
 
     Parameters
     ----------
     release_ns, latency_ns : int64 array, shape (n,)
         All cycles from the first, at least one. `NEVER_NS` marks a cycle that never finished.
+    data_age_ns : int64 array, shape (n,), optional
+        Age of each command's information when it took effect, if it does not date from the release.
     """
     start_ns = int(release_ns[0])
     done = latency_ns < NEVER_NS
-    if not done.all():
-        release_ns, latency_ns = release_ns[done], latency_ns[done]
-    at_ns = release_ns + latency_ns
+    at_ns = (release_ns + latency_ns)[done]
+    release_ns = release_ns[done] if data_age_ns is None else at_ns - data_age_ns[done]
     if not (at_ns[:-1] < at_ns[1:]).all():
         newer_ns = np.minimum.accumulate(at_ns[::-1])[::-1]
         fresh = np.append(at_ns[:-1] < newer_ns[1:], True)
@@ -166,27 +168,6 @@ def _age_percentile(low: Ints, high: Ints, percent: int) -> int:
         step = age + round(lacking / rate) if rate else under
         age = step if under < step < over else (under + over) // 2
     return over
-
-
-def misses_in(missed: NDArray[np.bool_], stretches: Iterable[int]) -> Iterator[NDArray[np.int32]]:
-    """Count the misses in every stretch of K consecutive cycles, for several K.
-
-    Parameters
-    ----------
-    missed : bool array, shape (n,)
-    stretches : iterable of int
-        K, cycles of a stretch.
-
-    Yields
-    ------
-    int32 array, shape (n - K + 1,)
-        The largest is the smallest m for which the cycles meet "at most m misses in any K". With
-        fewer than K cycles the array has one element, the number of all misses.
-    """
-    total = np.zeros(len(missed) + 1, np.int32)
-    np.cumsum(missed, dtype=np.int32, out=total[1:])
-    for stretch in stretches:
-        yield total[stretch:] - total[:-stretch] if len(missed) > stretch else total[-1:]
 
 
 def track(servo: Servo, actuated: EffectiveCommands, begin_ns: int, end_ns: int) -> TrackingError:

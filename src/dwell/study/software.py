@@ -136,7 +136,7 @@ def _used(contender: Contender, point: Point) -> Iterator[tuple[object, str | No
 
 
 def part_digests(description: Mapping[str, Any], sources: Sources) -> dict[str, str]:
-    """Return a digest of all that the runs of each player depend on, by the player.
+    """Return a digest of everything that determines the runs of each player, by the player.
 
     Parameters
     ----------

@@ -34,9 +34,10 @@ from dwell.model import FrozenDict, Problem
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints, Mask
 from dwell.model.order_statistic import rank_of
-from dwell.model.table_columns import SHARE_OF, USE_OF
+from dwell.model.stretches import misses_in
+from dwell.model.table_columns import AGE_OF, OVER_AGE_OF, SHARE_OF, USE_OF
 from dwell.record.moves import by_guard
-from dwell.study.quality import actuations, age_of_information, misses_in, track
+from dwell.study.quality import actuations, age_of_information, track
 
 if TYPE_CHECKING:
     import polars as pl
@@ -204,6 +205,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **_migrations(decisions, decided),
         **{SHARE_OF.format(candidate=name): share_of(those) for name, those in active.items()},
         "cost": answer["cost"],
+        **_ages(windows, counts, problem),
         **_unfinished(cycles.names("outcome")[counted][due]),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
@@ -255,6 +257,16 @@ def _answer(windows: TableArrays, counts: Mask, missed: Mask) -> dict[str, float
         "l95_ms": mean_of(windows["seen_l95_ms"][counts]),
         "cost": mean_of(windows["cost"][counts]),
     }
+
+
+def _ages(windows: TableArrays, counts: Mask, problem: Problem) -> dict[str, float]:
+    """Return means over windows: L95 and misses of chains, and the mean age if J weighs it."""
+    templates = (AGE_OF, OVER_AGE_OF)
+    chains = problem.pipeline.chains
+    columns = [template.format(chain=name) for name in chains for template in templates]
+    if problem.objective.weighs_age:
+        columns.append("seen_age_ms")
+    return {column: mean_of(windows[column][counts]) for column in columns}
 
 
 def moves_of(run: Run, problem: Problem) -> dict[str, int]:
@@ -318,6 +330,9 @@ def _actuator(cycles: TableArrays, counted: slice, problem: Problem) -> dict[str
     age = age_of_information(actuated, begin_ns, end_ns)
     row = {f"aoi_{name}": value for name, value in age._asdict().items()}
     if problem.servo is not None:
+        if problem.objective.latency is not None:
+            of_chain = (cycles[name] for name in ("chain_latency_ns", "chain_age_ns"))
+            actuated = actuations(release_ns, *(values[: counted.stop] for values in of_chain))
         tracking = track(problem.servo, actuated, begin_ns, end_ns)
         row |= {"tracking_rms_mm": tracking.rms_mm, "tracking_iae_mm": tracking.mean_mm}
     return row

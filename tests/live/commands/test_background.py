@@ -28,18 +28,35 @@ AWAY = "192.0.2.7"
 
 
 class Cell:
-    """The example's cell, run in the background by the command line."""
+    """The example's cell, run in the background by the command line.
+
+    `printed` is the output of the command that started it; `well` says that a test has left it as
+    the next one needs it.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.cell = RealCell(folder)
         self.file, self.problem = self.cell.file, self.cell.problem
         self.root, self.out = folder / "background", folder / "runs"
         self.folder = self.root / self.problem.name
+        self.text = self.file.read_text()
+        self.printed, self.well = "", False
+
+    @property
+    def names(self) -> set[str]:
+        return {*(f"agent@{node}" for node in self.problem.fabric.nodes), "controller@E"}
 
     def dwell(self, *words: str | Path) -> tuple[int, str, str]:
-        """Run a command, in a process of its own: what it starts is no child of the test's."""
+        """Run a command in this process."""
+        code, stdout, stderr = invoke("live", *words, "--state", self.root)
+        assert "Traceback" not in stderr
+        return code, stdout, stderr
+
+    def up(self, *more: str | Path) -> tuple[int, str, str]:
+        """Start it by a process of its own: its processes are no children of the test's."""
+        words = ("up", "--out", self.out, *more, self.file, "--state", self.root)
         done = subprocess.run(
-            [sys.executable, "-m", "dwell", "live", *map(str, words), "--state", str(self.root)],
+            [sys.executable, "-m", "dwell", "live", *map(str, words)],
             cwd=self.cell.folder,
             env=environment(),
             capture_output=True,
@@ -50,18 +67,28 @@ class Cell:
         assert "Traceback" not in done.stderr
         return done.returncode, done.stdout, done.stderr
 
-    def up(self, *more: str | Path) -> tuple[int, str, str]:
-        return self.dwell("up", "--out", self.out, *more, self.file)
-
     def refused(self, *more: str | Path) -> tuple[int, str]:
-        """Ask for what is not started, in this process; returns the exit code and what it says."""
-        words = ("--state", self.root, "--out", self.out, *more)
-        code, _, error = invoke("live", "up", *words, self.file)
-        assert "Traceback" not in error
+        """Call `dwell live up` where it starts nothing; return its exit code and its errors."""
+        code, _, error = self.dwell("up", "--out", self.out, *more, self.file)
         return code, error
 
     def down(self) -> tuple[int, str, str]:
         return self.dwell("down", self.file)
+
+    def restore(self) -> None:
+        """End it, with the files of the example."""
+        self.file.write_text(self.text)
+        self.cell.module.write_text(MOODY)
+        self.down()
+
+    def stand(self) -> None:
+        """Be up and healthy, from the test before if that has left it so."""
+        if not self.well:
+            self.restore()
+            code, self.printed, error = self.up()
+            assert code == 0, error
+        self.well = False
+        self.cell.until(lambda status: status["window"] and not status["silent"])
 
     def running(self, pattern: str) -> dict[str, psutil.Process]:
         found = {mark.stem: survivor(mark) for mark in self.folder.glob(pattern)}
@@ -88,25 +115,33 @@ class Cell:
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[Cell]:
     made = Cell(tmp_path)
-    text = made.file.read_text()
     yield made
-    made.file.write_text(text)
-    invoke("live", "down", made.file, "--state", made.root)
+    made.restore()
 
 
-def test_a_cell_comes_up_is_looked_at_and_goes_down(cell: Cell) -> None:
-    code, told, _ = cell.up()
-    assert code == 0
-    agents = {f"agent@{node}" for node in cell.problem.fabric.nodes}
-    names = {*agents, "controller@E"}
-    assert all(name in told for name in names)
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
+    made = Cell(tmp_path_factory.mktemp("shared"))
+    yield made
+    made.restore()
+
+
+@pytest.fixture
+def standing(shared: Cell) -> Cell:
+    """Return a cell that is up; to start one takes 7 s of a CPU, so tests pass it on."""
+    shared.stand()
+    return shared
+
+
+def test_a_cell_comes_up_and_is_looked_at(standing: Cell) -> None:
+    cell = standing
+    assert all(name in cell.printed for name in cell.names)
     running = cell.running("*.pid")
-    assert running.keys() == names
+    assert running.keys() == cell.names
     # A session of their own: what ends the terminal does not reach them.
     assert all(os.getsid(process.pid) == process.pid for process in running.values())
-    cell.cell.until(lambda status: status["window"] and not status["silent"])
 
-    code, _, error = cell.up()
+    code, error = cell.refused()
     assert code == 1
     assert "is up already" in error
     assert cell.running("*.pid") == running
@@ -122,17 +157,7 @@ def test_a_cell_comes_up_is_looked_at_and_goes_down(cell: Cell) -> None:
     assert code == 0
     assert "the run is kept in" in told
     follows_until_interrupted(cell, "sink.control@R2")
-
-    code, told, _ = cell.down()
-    assert code == 0
-    assert all(name in told for name in names)
-    assert cell.running("**/*.pid") == {}
-    assert cell.taken() == ""
-    # The controller was told to end, too: its run is complete.
-    assert len(list(cell.out.glob("*/run.json"))) == 1
-    code, told, _ = cell.down()
-    assert code == 0
-    assert "does not run here" in told
+    cell.well = True
 
 
 def follows_until_interrupted(cell: Cell, who: str) -> None:
@@ -152,31 +177,52 @@ def follows_until_interrupted(cell: Cell, who: str) -> None:
     assert following.returncode == 130
 
 
-def test_what_dead_agents_have_left_is_named_and_ended(cell: Cell) -> None:
-    assert cell.up()[0] == 0
-    cell.cell.until(lambda status: status["window"])
-    for process in cell.running("*.pid").values():
-        process.send_signal(signal.SIGKILL)
-    wait_until(lambda: not cell.running("*.pid"))
-    left = cell.running("*/*.pid")
-    assert "sink.control@R2" in left
-    code, _, error = cell.up()
+def test_other_code_is_taken_over_node_by_node(standing: Cell) -> None:
+    cell = standing
+    # Perception is on E; R1 and R2 have what every candidate needs.
+    assert invoke("live", "pin", cell.file, "SO")[0] == 0
+    assert invoke("live", "pin", cell.file, "--off")[0] == 0
+    before = cell.running("**/*.pid")
+    cell.cell.module.write_text(MOODY.replace("the old code", "the new code"))
+    code, told, error = cell.up("--again")
+    assert (code, error) == (0, "")
+    assert told.splitlines()[:1] == ["E runs the new code"]
+    assert "code is taken over by " in told
+    after = cell.running("**/*.pid")
+    assert after.keys() == before.keys()
+    same = {who for who in before if before[who] == after[who]}
+    assert same == {"agent@E", "agent@R1", "agent@R2", "controller@E"}
+    assert "the new code" in cell.cell_log("E", "perception@E")
+    status = cell.cell.until(lambda status: status["health"] == "ok")
+    assert status["drained"] == []
+    cell.well = True
+
+
+def test_other_wiring_ends_all_and_starts_it_where_that_is_allowed(standing: Cell) -> None:
+    cell = standing
+    before, text = cell.running("**/*.pid"), cell.file.read_text()
+    cell.file.write_text(text.replace("policy: LOC", "policy: NO"))
+    code, error = cell.refused("--again")
+    assert (code, "unknown policy 'NO'" in error) == (2, True)
+    cell.file.write_text(text.replace("probe_cycles: 5", "probe_cycles: 6"))
+    code, error = cell.refused("--again")
     assert code == 1
-    assert "an agent of light-follower has died, and its processes still run" in error
-    assert "sink.control@R2" in error
-    assert cell.running("*.pid") == {}
-    assert cell.running("*/*.pid") == left
-    code, told, _ = cell.down()
-    assert code == 0
-    assert "sink.control@R2" in told
-    assert cell.running("**/*.pid") == {}
-    assert cell.taken() == ""
+    assert re.search(r"takes about \d+ s without commands; with --yes it is done", error)
+    assert cell.running("**/*.pid") == before
+    code, told, error = cell.up("--again", "--yes")
+    assert (code, error) == (0, "")
+    assert "s without commands" in told
+    assert "light-follower is up: " in told
+    assert all(who in told for who in ("agent@R1", "agent@E", "agent@R2", "controller@E"))
+    cell.cell.until(lambda status: status["window"] and status["health"] == "ok")
+    assert not {*before.values()} & {*cell.running("**/*.pid").values()}
+    assert cell.up("--again")[1].startswith("cell.yaml: text is taken over by agent@E, ")
+    cell.well = True
 
 
-def test_an_edited_cell_is_taken_over_after_an_orderly_end_alone(cell: Cell) -> None:
+def test_an_edited_cell_is_taken_over_after_an_orderly_end_alone(standing: Cell) -> None:
     """Whatever dies meanwhile begins with the bytes that all others have."""
-    assert cell.up()[0] == 0
-    cell.cell.until(lambda status: status["window"] and not status["silent"])
+    cell = standing
     text = cell.file.read_text()
     cell.file.write_text(text.replace("guard_cycles: 40", "guard_cycles: 41"))
     cell.cell.module.write_text("broken(")
@@ -212,17 +258,18 @@ def test_an_edited_cell_is_taken_over_after_an_orderly_end_alone(cell: Cell) -> 
     cell.cell.module.write_text(MOODY)
     code, _, error = cell.up()
     assert (code, error) == (0, "")
+    cell.well = True
     assert "guard_cycles: 41" in (cell.folder / "R1" / "cell" / "cell.yaml").read_text()
 
 
-def test_other_decisions_are_taken_over_while_every_process_runs_on(cell: Cell) -> None:
-    code, error = cell.refused("--again")
-    assert (code, "does not run here; this starts it: dwell live up " in error) == (1, True)
-    assert cell.up()[0] == 0
-    cell.cell.until(lambda status: status["window"] and not status["silent"])
+def test_other_decisions_are_taken_over_while_every_process_runs_on_until_it_goes_down(
+    standing: Cell,
+) -> None:
+    cell = standing
     assert invoke("live", "pin", "SO", "--cell", cell.file)[0] == 0
     running = cell.running("**/*.pid")
-    (first,) = cell.out.glob("light-follower-*")
+    earlier = {*cell.out.glob("light-follower-*")}
+    (first,) = (one for one in earlier if not (one / "run.json").exists())
     text = cell.file.read_text()
     cell.file.write_text(text.replace("min_improvement: 0.05", "min_improvement: 0.5"))
     code, told, error = cell.up("--again")
@@ -234,57 +281,42 @@ def test_other_decisions_are_taken_over_while_every_process_runs_on(cell: Cell) 
     assert (status["pinned"], status["placement"], status["changed"]) == ("SO", "SO", None)
     assert not any("changed" in process["note"] for process in status["processes"].values())
     assert (first / "run.json").exists()
-    assert cell.down()[0] == 0
-    (second,) = (one.parent for one in cell.out.glob("*/run.json") if one.parent != first)
+    code, told, _ = cell.down()
+    assert code == 0
+    assert all(name in told for name in cell.names)
+    assert cell.running("**/*.pid") == {}
+    assert cell.taken() == ""
+    # The controller ends with the others, so its run is complete.
+    (second,) = {one.parent for one in cell.out.glob("*/run.json")} - earlier
     before, after = open_run(first), open_run(second)
     assert "continues" not in before.meta
     assert after.meta["continues"] == first.name
     found = [run.problem.controller.min_improvement for run in (before, after)]
     assert found == [0.05, 0.5]
-
-
-def test_other_code_is_taken_over_node_by_node(cell: Cell) -> None:
-    assert cell.up()[0] == 0
-    cell.cell.until(lambda status: status["window"] and not status["silent"])
-    # Perception is on E; R1 and R2 have what every candidate needs.
-    assert invoke("live", "pin", cell.file, "SO")[0] == 0
-    assert invoke("live", "pin", cell.file, "--off")[0] == 0
-    before = cell.running("**/*.pid")
-    cell.cell.module.write_text(MOODY.replace("the old code", "the new code"))
-    code, told, error = cell.up("--again")
-    assert (code, error) == (0, "")
-    assert told.splitlines()[:1] == ["E runs the new code"]
-    assert "code is taken over by " in told
-    after = cell.running("**/*.pid")
-    assert after.keys() == before.keys()
-    same = {who for who in before if before[who] == after[who]}
-    assert same == {"agent@E", "agent@R1", "agent@R2", "controller@E"}
-    assert "the new code" in cell.cell_log("E", "perception@E")
-    status = cell.cell.until(lambda status: status["health"] == "ok")
-    assert status["drained"] == []
-    assert cell.down()[0] == 0
-
-
-def test_other_wiring_ends_all_and_starts_it_where_that_is_allowed(cell: Cell) -> None:
-    assert cell.up()[0] == 0
-    cell.cell.until(lambda status: status["window"] and not status["silent"])
-    before, text = cell.running("**/*.pid"), cell.file.read_text()
-    cell.file.write_text(text.replace("policy: LOC", "policy: NO"))
+    code, told, _ = cell.down()
+    assert (code, "does not run here" in told) == (0, True)
     code, error = cell.refused("--again")
-    assert (code, "unknown policy 'NO'" in error) == (2, True)
-    cell.file.write_text(text.replace("guard_cycles: 40", "guard_cycles: 41"))
-    code, error = cell.refused("--again")
+    assert (code, "does not run here; this starts it: dwell live up " in error) == (1, True)
+
+
+def test_what_dead_agents_have_left_is_named_and_ended(standing: Cell) -> None:
+    cell = standing
+    for process in cell.running("*.pid").values():
+        process.send_signal(signal.SIGKILL)
+    wait_until(lambda: not cell.running("*.pid"))
+    left = cell.running("*/*.pid")
+    assert "sink.control@R2" in left
+    code, error = cell.refused()
     assert code == 1
-    assert re.search(r"takes about \d+ s without commands; with --yes it is done", error)
-    assert cell.running("**/*.pid") == before
-    code, told, error = cell.up("--again", "--yes")
-    assert (code, error) == (0, "")
-    assert "s without commands" in told
-    assert "light-follower is up: " in told
-    assert all(who in told for who in ("agent@R1", "agent@E", "agent@R2", "controller@E"))
-    cell.cell.until(lambda status: status["window"] and status["health"] == "ok")
-    assert not {*before.values()} & {*cell.running("**/*.pid").values()}
-    assert cell.up("--again")[1].startswith("cell.yaml: text is taken over by agent@E, ")
+    assert "an agent of light-follower has died, and its processes still run" in error
+    assert "sink.control@R2" in error
+    assert cell.running("*.pid") == {}
+    assert cell.running("*/*.pid") == left
+    code, told, _ = cell.down()
+    assert code == 0
+    assert "sink.control@R2" in told
+    assert cell.running("**/*.pid") == {}
+    assert cell.taken() == ""
 
 
 def test_a_taken_port_is_named_and_nothing_is_started(cell: Cell) -> None:

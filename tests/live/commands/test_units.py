@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import dwell
+from docs import units as units_page
 from dwell.live.commands.units import escaped_name, unit_texts, verify
 from dwell.live.wire.wiring import wire
 from tests.cli.live_cell import RealCell
@@ -100,23 +101,8 @@ def test_an_unknown_node_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "units").exists()
 
 
-def test_the_manual_shows_these_units() -> None:
-    page = (ROOT / "docs" / "howto" / "deploy.md").read_text(encoding="utf-8")
-    shown = re.findall(r"^```ini\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
-    made = {
-        node: unit_texts(
-            PROBLEM,
-            node,
-            Path("/etc/dwell/cell.yaml"),
-            user="robot",
-            keys=Path("/etc/dwell/keys"),
-            program=("/opt/dwell/bin/dwell",),
-        )
-        for node in ("R1", "E")
-    }
-    assert shown == [made["R1"][agent_unit("R1")], made["E"][CONTROLLER_UNIT]]
-    assert f"/{agent_unit('R1')}`" in page
-    assert f"/{CONTROLLER_UNIT}`" in page
+def test_the_page_of_units_is_the_generated_one() -> None:
+    assert units_page.PAGE.read_text(encoding="utf-8") == units_page.page()
 
 
 def test_agents_and_controllers_report_to_systemd(

@@ -82,7 +82,7 @@ def done(cycle: int, sink: str = "arm", released_ns: int = 0) -> Completion:
 
 
 def test_the_best_round_trip_counts_until_it_is_old() -> None:
-    intervals = Intervals("R1", {"arm"})
+    intervals = Intervals("R1", lambda _: frozenset({"arm"}))
     assert intervals.return_ns("R2") is None
     # Sent at 0, heard at 100 s of the other clock, answered 10 ms later, here at 16 ms.
     intervals.hear(beat(100 * S + 10 * MS, 100 * S, 0), 16 * MS)
@@ -95,7 +95,7 @@ def test_the_best_round_trip_counts_until_it_is_old() -> None:
 
 
 def test_a_cycle_ends_with_its_last_sink_and_copies_change_nothing() -> None:
-    intervals = Intervals("R1", {"arm", "gripper"})
+    intervals = Intervals("R1", lambda _: frozenset({"arm", "gripper"}))
     intervals.hear(beat(100 * S + 10 * MS, 100 * S, 0), 14 * MS)
     intervals.completed(done(5), 40 * MS, newest=5, direct=True)
     intervals.completed(done(5), 60 * MS, newest=5, direct=False)
@@ -108,7 +108,7 @@ def test_a_cycle_ends_with_its_last_sink_and_copies_change_nothing() -> None:
 
 
 def test_cycles_that_never_complete_take_no_memory() -> None:
-    intervals = Intervals("R1", {"arm", "gripper"})
+    intervals = Intervals("R1", lambda _: frozenset({"arm", "gripper"}))
     for cycle in range(10_000):
         intervals.completed(done(cycle), cycle, newest=cycle, direct=True)
     waiting = intervals._waiting

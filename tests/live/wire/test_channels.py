@@ -22,7 +22,7 @@ from tests.live.small_world import Bench, Counting, World, stateful
 from tests.live.trust.rosters import roster_of
 
 KEPT = Path(__file__).with_name("channels.json")
-CELLS = "canonical", "cloud", "fan-in", "live/cell"
+CELLS = "canonical", "cloud", "fan-in", "inner-loop", "live/cell"
 
 
 def agreed() -> dict[str, Any]:

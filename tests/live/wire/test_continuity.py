@@ -357,7 +357,7 @@ def test_late_beats_over_the_detour_are_no_news() -> None:
 
 
 def test_a_false_completion_stops_no_intervals() -> None:
-    intervals = Intervals("R1", {"arm"})
+    intervals = Intervals("R1", lambda _: frozenset({"arm"}))
     intervals.hear(
         Beat("sink.arm@R2", "R2", 1, 20 * MS, True, (Heard("stamper@R1", "R1", 0, 10 * MS),)),
         14 * MS,

@@ -205,8 +205,9 @@ def weigh(
     outcome.wrong += out_of_order(applied)
     if all(hit_by(problem, fault) is not None or not _strikes_sink(fault) for fault in faults):
         period_ms = problem.pipeline.period_ms
+        max_age_ms = max(map(problem.max_age_ms, problem.pipeline.sinks))
         during = [one for one in seen if one.at_ns >= begin_ns - period_ms * 1e6]
-        outcome.late += unsafe(during, problem.max_age_ms + period_ms + outcome.stall_ms)
+        outcome.late += unsafe(during, max_age_ms + period_ms + outcome.stall_ms)
 
 
 def too_old(problem: Problem, seen: Sequence[Seen], stamped_ns: Mapping[int, int]) -> list[str]:
@@ -218,7 +219,7 @@ def too_old(problem: Problem, seen: Sequence[Seen], stamped_ns: Mapping[int, int
         Instants of the stamps, by cycle, on the true clock.
     """
     # The process may lose the CPU between the gate's check and the call of the actuator.
-    limit_ms = problem.max_age_ms + problem.pipeline.period_ms
+    limit_ms = max(map(problem.max_age_ms, problem.pipeline.sinks)) + problem.pipeline.period_ms
     return [
         f"cycle {one.cycle} was actuated {age_ms:.0f} ms after it was stamped"
         for one in seen

@@ -118,16 +118,16 @@ def _words(value: Any) -> tuple[str, ...]:
     return words
 
 
-_HOST = shape_of(RealHost, {}, instead={"run": WrittenForm("text, list of texts", _words)})
-_LINK = shape_of(LinkCommands, {}, instead={"begin": WrittenForm("text", _impairing)})
+HOST = shape_of(RealHost, {}, instead={"run": WrittenForm("text, list of texts", _words)})
+LINK = shape_of(LinkCommands, {}, instead={"begin": WrittenForm("text", _impairing)})
 INVENTORY = FileKind.of(
     "inventory",
     FORMAT,
     VERSION,
     "Inventory",
     "The hosts of a cell's nodes.",
-    required("hosts", MappingForm(_HOST, keeps=True), "The host of each node.", {}),
-    optional("links", MappingForm(_LINK, keeps=True), "Commands that impair a link.", "none"),
+    required("hosts", MappingForm(HOST, keeps=True), "The host of each node.", {}),
+    optional("links", MappingForm(LINK, keeps=True), "Commands that impair a link.", "none"),
 )
 
 

@@ -38,10 +38,10 @@ class CampaignQuestion(NamedTuple):
     Parameters
     ----------
     answer : {"yes", "no", "in part", "not shown"}
-        By V_D: lower than all others in every scenario, in some, in none and higher in some, or
-        not told.
+        By V_D of the first policy: "yes" if it is lower than all others in every scenario, "in
+        part" if in some, "no" if it is higher in some and lower in none.
     table : DataFrame
-        One row a comparison and metric: ``scenario``, ``first``, ``second``, ``metric``, ``n``
+        One row per comparison and metric: ``scenario``, ``first``, ``second``, ``metric``, ``n``
         (repetitions), ``effect`` (the first less the second) with ``low`` and ``high``, ``p``
         (Holm's), ``p_least`` and ``word``.
     """
@@ -52,7 +52,7 @@ class CampaignQuestion(NamedTuple):
 
 
 def questions(measured: MeasuredCampaign) -> tuple[CampaignQuestion, ...]:
-    """Return the questions that the runs have anything to say on, answered."""
+    """Return the questions that the runs can answer, with their answers."""
     comparison = measured.comparison
     problem, policies = comparison.problem, comparison.policies
     rules, singles = (_of_family(policies, names) for names in (TOGETHER, (SINGLE,)))
@@ -116,7 +116,7 @@ def _answered(
     pairs: Sequence[tuple[str, str]],
     subject: tuple[str, Sequence[str]],
 ) -> CampaignQuestion:
-    """Compare pairs in every scenario and metric; `subject` is whom the answer is about."""
+    """Compare pairs in every scenario and metric; the answer is about `subject`, and its others."""
     import polars as pl
 
     names = {
@@ -145,7 +145,7 @@ def _answered(
 
 
 def answer_of(table: pl.DataFrame, first: str, others: Sequence[str]) -> Answer:
-    """Return what the table's comparisons of V_D say of the first against all others."""
+    """Return the answer by the V_D of `first` against all others."""
     words: dict[str, set[str]] = {}
     for row in table.filter(metric="violation_rate", first=first).iter_rows(named=True):
         if row["second"] in others:

@@ -57,9 +57,12 @@ const moved = ({ migrations, returns, guard_moves }) => {
 export const decided = (root, cell, page) => {
   const rows = new Map();
   const body = make("tbody");
-  const words = ["candidate", "J", "L95 (ms)", "V_D", ""];
+  const metrics = ["J", "L95 (ms)", "V_D", ...(cell.weighs_age ? ["age (ms)"] : [])];
+  const shown = (value) =>
+    [number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 2), number(value?.age_ms, 1)].slice(0, metrics.length);
+  const words = ["candidate", ...metrics, ""];
   for (const { name, hue } of cell.candidates) {
-    const values = ["", "", ""].map(() => make("td", { class: "num" }));
+    const values = metrics.map(() => make("td", { class: "num" }));
     const mark = make("td");
     const head = make("th", { scope: "row" }, make("span", { class: "swatch", hue, "aria-hidden": "true" }), name);
     const button = page.control ? make("button", { type: "button", text: "Pin", "data-pin": name, onclick: () => page.pin(name) }) : null;
@@ -70,7 +73,7 @@ export const decided = (root, cell, page) => {
   const table = make("table", { class: "candidates" }, caption, head(page.control ? [...words, ""] : words), body);
   const why = make("p", { class: "last" });
   const predicted = make("tbody");
-  const against = make("table", { class: "against" }, make("caption"), head(["", "J", "L95 (ms)", "V_D"]), predicted);
+  const against = make("table", { class: "against" }, make("caption"), head(["", ...metrics]), predicted);
   const acts = make("p", { class: "acts" });
   root.querySelector(".decided").replaceChildren(make("div", { class: "scroll" }, table), why, make("div", { class: "scroll" }, against), acts);
   if (page.control) {
@@ -81,7 +84,7 @@ export const decided = (root, cell, page) => {
   return (state) => {
     for (const [name, { row, values, mark, button }] of rows) {
       const known = state.candidates?.[name] ?? {};
-      const texts = [number(known.cost, 2), number(known.l95_ms, 1), percent(known.violation_rate, 2)];
+      const texts = shown(known);
       values.forEach((value, i) => say(value, texts[i]));
       row.classList.toggle("here", name === state.placement);
       const marks = [];
@@ -95,7 +98,7 @@ export const decided = (root, cell, page) => {
     say(why, decision(state, cell));
     const { window } = state;
     say(against.querySelector("caption"), window ? `Predicted against seen: window ${window.number}, under ${window.placement}` : "Predicted against seen: no window yet");
-    const line = (name, value) => [name, number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 2)];
+    const line = (name, value) => [name, ...shown(value)];
     predicted.replaceChildren(
       ...[line("predicted", state.predicted), line("seen", window?.seen)].map(([name, ...texts]) =>
         make("tr", {}, make("th", { scope: "row", text: name }), ...cells(texts)),

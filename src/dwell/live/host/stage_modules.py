@@ -100,7 +100,7 @@ def actuator_of(problem: Problem, name: str) -> CellActuator:
 def _prepare(made: CellCode, where: str, problem: Problem, name: str, index: int = 0) -> None:
     """Tell a stage or an actuator its place, and check it; raise a LiveError that names it."""
     longest = max((flow.payload_bytes for flow in problem.pipeline.outputs(name)), default=0)
-    limits = problem.folder, problem.max_age_ms, longest, problem.live.clock == "system"
+    limits = problem.folder, problem.max_age_ms(name), longest, problem.live.clock == "system"
     made.placed(StagePlace(problem.name, name, index, *limits))
     try:
         made.check()

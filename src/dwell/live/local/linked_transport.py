@@ -24,7 +24,7 @@ from dwell.live.wire.transport import Arrival, Lane, Receive, Transport
 #: First byte of a header with the source node; MessagePack never uses this byte.
 _SOURCE = b"\xc1"
 #: Kinds of keys whose fifth part is the target node (see `Keys`).
-_FOR_ONE_NODE = frozenset({"in", "state", "snapshot"})
+_FOR_ONE_NODE = frozenset({"in", "state", "value", "snapshot"})
 #: Period of the checks whether a cut that holds messages has ended.
 LOOK_NS = 2_000_000
 MOST_STREAMS = 4_096

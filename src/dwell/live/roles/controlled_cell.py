@@ -579,11 +579,13 @@ class ControlledCell:
         windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
         # A migration that is still under way at the next decision is given up.
         self._give_up(now_ns)
-        # Miss the decision if less than half of its cycles are known, or the next one is due too.
+        # Miss the decision if less than half of its cycles are known, if no sink was due in them, or
+        # if the next decision is due too.
         next_ns = windows.due_ns(now_ns) if windows.often else None
         late = next_ns is not None and next_ns <= now_ns
         looked = windows.looked
-        if late or looked is None or 2 * windows.heard < self.place.problem.decide_cycles:
+        unknown = 2 * windows.heard < self.place.problem.decide_cycles
+        if late or looked is None or unknown or not len(closed.latency_ns):
             self.controller.miss()
             return
         course, proven = self.course, self._proven

@@ -18,9 +18,19 @@ import numpy as np
 from dwell.control import Evidence, Instants
 from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
-from dwell.live.wire.messages import ACTUATED, BEHIND, NOT_APPLIED, STALE, Completion, Hop, Stamp
+from dwell.live.wire.messages import (
+    ACTUATED,
+    BEHIND,
+    NOT_APPLIED,
+    SAMPLED,
+    STALE,
+    Completion,
+    Hop,
+    Stamp,
+)
 from dwell.live.wire.wiring import lane_of
-from dwell.model import Execution, Problem
+from dwell.model import Execution, Flow, Problem
+from dwell.model.due_tasks import DueTasks
 from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
@@ -35,6 +45,8 @@ UNKNOWN = -1
 MAX_SHADOWS = 16
 #: Least share of a window in which a hook must have measured an accelerator.
 HOOKED_SHARE = 0.5
+#: Instant of a job or message in a cycle in which it is not due.
+NOT_DUE = -2
 #: Outcomes of jobs that ended before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
 
@@ -60,6 +72,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         First release of the run, on the stamper's clock.
     heard : bool
         Whether a message with its stamp has arrived; if not, only its neighbours are known.
+    idle : bool
+        Whether no sink is due in it.
 
     Attributes
     ----------
@@ -71,6 +85,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         Completions by sink.
     heard_ns : dict of str to int
         Arrivals of the completions on the controller's clock, if known, by sink.
+    samples : dict of (str, str) to Completion
+        Reports of messages that have arrived at a task that samples them, by source and target.
     replaced : dict of str to Completion
         Reports of jobs that a newer cycle replaced, by task.
     latency_ns : int
@@ -101,11 +117,13 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     at_ns: int
     origin_ns: int
     heard: bool
+    idle: bool = False
     stamped_ns: int | None = None
     group_ns: int = UNKNOWN
     reports: dict[str, Completion] = {}
     heard_ns: dict[str, int] = {}
     shadows: tuple[Completion, ...] = ()
+    samples: dict[tuple[str, str], Completion] = {}
     replaced: dict[str, Completion] = {}
     latency_ns: int = NEVER_NS
     parts_ns: tuple[int, int, int] | None = None
@@ -121,11 +139,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     shifts: dict[str, Shift] = {}
 
     @classmethod
-    def of(cls, stamp: Stamp, origin_ns: int) -> LiveCycle:
+    def of(cls, stamp: Stamp, origin_ns: int, *, idle: bool = False) -> LiveCycle:
         """Return the cycle of a stamp."""
         at_ns = stamp.released_ns - origin_ns
         who = stamp.run, stamp.cycle, stamp.term, stamp.placement, stamp.shadow
-        return cls(*who, at_ns, origin_ns, heard=True)
+        return cls(*who, at_ns, origin_ns, heard=True, idle=idle)
 
     @property
     def key(self) -> tuple[int, int]:
@@ -137,6 +155,15 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         """Reported jobs of this cycle, not of its shadow; several sinks may report one job."""
         for done in (*self.replaced.values(), *self.reports.values()):
             yield from done.hops
+        for done in self.samples.values():
+            yield from done.hops[:-1]
+
+    @property
+    def all_reports(self) -> Iterator[Completion]:
+        """Reports with jobs of this cycle, not of its shadow."""
+        yield from self.reports.values()
+        yield from self.replaced.values()
+        yield from self.samples.values()
 
     @property
     def segment(self) -> tuple[int, int, str]:
@@ -157,6 +184,9 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
             if new:
                 self.shadows += (completion,)
             return new
+        if completion.outcome == SAMPLED:
+            flow = next(iter(_arrived(completion)), "")
+            return self.samples.setdefault((flow, completion.sink), completion) is completion
         if completion.outcome == REPLACED:
             return self.replaced.setdefault(completion.sink, completion) is completion
         if completion.sink in self.reports:
@@ -195,14 +225,14 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     @property
     def untold(self) -> bool:
         """Whether it is unknown if the cycle has completed."""
-        return self.deaf and not (self.reports or self.replaced or self.told)
+        return self.deaf and not (self.reports or self.replaced or self.told or self.idle)
 
     def missed(self, deadline_ns: int) -> bool:
         """Whether it was later than D, unfinished at the end of its window, or not applied.
 
         A command that the gate found stale counts as missed, even if its latency is below D.
         """
-        if self.untold:
+        if self.untold or self.idle:
             return False
         if self.came_to(NOT_APPLIED, STALE):
             return True
@@ -211,13 +241,18 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
 
 
 def told(cycles: Sequence[LiveCycle]) -> Sequence[LiveCycle]:
-    """Return the cycles of a window whose outcome is known; all cycles if none is known."""
-    return [cycle for cycle in cycles if not cycle.untold] or cycles
+    """Return the cycles of a window whose outcome is known; all cycles if none is known.
+
+    Idle cycles are left out.
+    """
+    counted = [cycle for cycle in cycles if not cycle.idle]
+    return [cycle for cycle in counted if not cycle.untold] or counted
 
 
 def violation_rate(cycles: Sequence[LiveCycle], deadline_ns: int) -> float:
-    """Return V_D, the share of cycles that missed their deadline."""
-    return sum(cycle.missed(deadline_ns) for cycle in cycles) / len(cycles)
+    """Return V_D, the share of cycles that missed their deadline; NaN without cycles."""
+    missed = sum(cycle.missed(deadline_ns) for cycle in cycles)
+    return missed / len(cycles) if cycles else math.nan
 
 
 class Ledger:
@@ -225,7 +260,9 @@ class Ledger:
 
     def __init__(self, problem: Problem, offsets: Offsets) -> None:
         pipeline = problem.pipeline
-        self.sinks = frozenset(name for name in pipeline.tasks if not pipeline.outputs(name))
+        self.sinks = frozenset(pipeline.sinks)
+        #: Tasks that run in each cycle.
+        self.due = DueTasks(pipeline)
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
         self._stamper_node = problem.stamper_node
         self._nodes, self._resources = problem.fabric.nodes, problem.fabric.resources
@@ -233,6 +270,7 @@ class Ledger:
         self.loads = {node: NodeLoad() for node in self._nodes}
         self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
         self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
+        self._sampled = {(f.source, f.target) for f in pipeline.flows if f.sampled}
         self._codes = {name: code for code, name in enumerate(problem.candidates)}
         self._every = frozenset(pipeline.tasks)
         order = pipeline.topological()
@@ -242,14 +280,18 @@ class Ledger:
 
     def tells(self, completion: Completion) -> bool:
         """Whether a completion's task can have its outcome: before a sink any task, else a sink."""
-        early = completion.outcome in {SHADOW, REPLACED}
+        early = completion.outcome in {SHADOW, REPLACED, SAMPLED}
         return completion.sink in (self._every if early else self.sinks)
 
     # ------------------------------------------------------------------------ latency
 
     def complete(self, cycle: LiveCycle) -> bool:
-        """Whether every sink has reported a cycle."""
-        return len(cycle.reports) == len(self.sinks)
+        """Whether every due sink has reported a cycle; false for an idle cycle."""
+        return not cycle.idle and self.due.sinks(cycle.number) <= cycle.reports.keys()
+
+    def is_replaced(self, cycle: LiveCycle) -> bool:
+        """Whether a later cycle has replaced a job that a due sink waits for."""
+        return any(self.due.is_needed(task, cycle.number) for task in cycle.replaced)
 
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
         """Compute latency and parts of a complete cycle.
@@ -294,6 +336,11 @@ class Ledger:
             found = self._offsets.to_reference(node, instant_ns)
             shift = cycle.shifts[node] = Shift(found.instant_ns - instant_ns, found.bound_ns)
         return instant_ns + shift.by_ns - cycle.origin_ns
+
+    def instant_ns(self, cycle: LiveCycle, node: str, instant_ns: int) -> int | None:
+        """Convert an instant as `_since_origin`; None if the clocks have not been compared."""
+        at_ns = self._since_origin(cycle, node, instant_ns)
+        return at_ns if cycle.shifts[node].bound_ns < UNBOUNDED_NS else None
 
     def _doubt(self, cycle: LiveCycle, done: Completion) -> None:
         """Mark the clocks as not compared if a cycle's instants are impossible with them.
@@ -488,7 +535,8 @@ class Ledger:
         jobs: Jobs = {}
         apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
         hops = [(hop, False) for hop in cycle.hops]
-        hops += [(hop, hop.task in apart) for done in cycle.shadows for hop in done.hops]
+        ended = [hop for done in cycle.shadows for hop in self._ran(done)]
+        hops += [(hop, hop.task in apart) for hop in ended]
         for hop, shadow in hops:
             if hop.task not in self._tasks or (shadow and hop.task in self.sinks):
                 continue
@@ -555,6 +603,7 @@ class Ledger:
         `shadows` tells whether the result has the shadows' instants.
         """
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
+        self._mark_not_due(known, cycles)
         through = np.full(len(cycles), -1, np.int64)
         for row, cycle in enumerate(cycles):
             if cycle.shadow in self._codes:
@@ -562,13 +611,21 @@ class Ledger:
                 apart = self._diverging(cycle)
                 for report in cycle.shadows:
                     self._doubt(cycle, report)
-                    self._enter(of_shadows, row, cycle, report.hops, apart)
+                    ran = self._ran(report)
+                    self._enter(of_shadows, row, cycle, ran, apart)
                     # Jobs that the shadow shares with the cycle, whose own report may be missing.
-                    self._enter(known, row, cycle, report.hops, self._every - apart)
+                    self._enter(known, row, cycle, ran, self._every - apart)
+                    if len(ran) < len(report.hops):
+                        self._enter_arrivals(of_shadows, row, cycle, report.hops[-1])
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._doubt(cycle, report)
                 self._enter(known, row, cycle, report.hops, self._every)
-            if cycle.heard and not (cycle.deaf or cycle.reports or cycle.replaced or cycle.told):
+            for report in cycle.samples.values():
+                self._doubt(cycle, report)
+                self._enter(known, row, cycle, report.hops[:-1], self._every)
+                self._enter_arrivals(known, row, cycle, report.hops[-1])
+            reported = cycle.deaf or cycle.reports or self.is_replaced(cycle) or cycle.told
+            if cycle.heard and not (reported or cycle.idle):
                 self._mark_lost(known, row, cycle)
         for tables in (known, of_shadows):
             tables["work_ns"][tables["end_ns"] > close_ns] = UNKNOWN
@@ -590,6 +647,17 @@ class Ledger:
         columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), len(self._tasks))
         columns["arrived_ns"] = len(self._flows)
         return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
+
+    def _mark_not_due(self, known: Mapping[str, Ints], cycles: Sequence[LiveCycle]) -> None:
+        """Mark the jobs and messages of cycles in which they are not due."""
+        if not self._pipeline.has_rates:
+            return
+        numbers = np.array([cycle.number for cycle in cycles], np.int64)
+        of_tasks = np.array([self.due.rates[name] for name in self._tasks])
+        of_flows = np.array([self._pipeline.message_rate(flow) for flow in self._pipeline.flows])
+        for name, instants in known.items():
+            rates = of_flows if name == "arrived_ns" else of_tasks
+            instants[numbers[:, None] % rates != 0] = NOT_DUE
 
     def _enter(
         self,
@@ -615,21 +683,38 @@ class Ledger:
             # A shadow's last messages arrive at a sink whose job never runs.
             if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
                 known["ready_ns"][row, column] = max(ready_ns, 0)
-            for source, arrived_ns in hop.inputs:
-                flow = self._flows.get((source, hop.task))
-                if flow is not None:
-                    known["arrived_ns"][row, flow] = max(arrived_ns + shift_ns, 0)
+            self._enter_arrivals(known, row, cycle, hop)
+
+    def _enter_arrivals(
+        self, known: Mapping[str, Ints], row: int, cycle: LiveCycle, hop: Hop
+    ) -> None:
+        """Enter the instants of the messages that reached a job."""
+        for source, arrived_ns in hop.inputs:
+            flow = self._flows.get((source, hop.task))
+            at_ns = self._since_origin(cycle, hop.node, arrived_ns)
+            if flow is not None and cycle.shifts[hop.node].bound_ns < UNBOUNDED_NS:
+                known["arrived_ns"][row, flow] = max(at_ns, 0)
+
+    def _ran(self, done: Completion) -> tuple[Hop, ...]:
+        """Return the jobs of a shadow, without the arrival of its output at a sampling task."""
+        sampled = any((source, done.sink) in self._sampled for source in _arrived(done))
+        return done.hops[:-1] if sampled else done.hops
 
     def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
         """Mark the first unconfirmed message between two nodes as lost."""
         nodes = self._candidates[cycle.placement]
         for flow in self._forward:
             column = self._flows[flow.source, flow.target]
-            if nodes[flow.source] != nodes[flow.target] and known["arrived_ns"][row, column] < 0:
+            is_lost = known["arrived_ns"][row, column] == UNKNOWN
+            if nodes[flow.source] != nodes[flow.target] and is_lost and self._loses(flow, cycle):
                 source = self._tasks[flow.source]
                 if known["end_ns"][row, source] < 0:
                     known["end_ns"][row, source] = cycle.at_ns
                 return
+
+    def _loses(self, flow: Flow, cycle: LiveCycle) -> bool:
+        """Whether the loss of a flow's message loses a cycle."""
+        return not flow.sampled and self.due.is_needed(flow.target, cycle.number)
 
     def unreached(self, cycle: LiveCycle, through: str) -> tuple[str, str] | None:
         """Return source and target of the first unconfirmed message between two nodes.
@@ -648,7 +733,10 @@ class Ledger:
         }
         idle = {hop.task for hop in hops if hop.ended_ns == UNKNOWN and nodes[hop.task] == hop.node}
         missing = []
+        of_shadow, number = through != cycle.placement, cycle.number
         for one in self._forward:
+            if not (self.due.sends(one, number) if of_shadow else self._loses(one, cycle)):
+                continue
             if one.source in idle:
                 idle.add(one.target)
             elif nodes[one.source] != nodes[one.target] and (one.source, one.target) not in there:
@@ -667,6 +755,12 @@ class Ledger:
             here, there = (self._candidates[name] for name in pair)
             self._apart[pair] = self._pipeline.diverging(here, there)
         return self._apart[pair]
+
+    def shadow_ends(self, cycle: LiveCycle) -> frozenset[str]:
+        """Return the tasks that report the end of a cycle's shadow; none without a shadow."""
+        if cycle.shadow not in self._codes:
+            return frozenset()
+        return self.due.shadow_ends(self._diverging(cycle), cycle.number)
 
     def shadow_bytes(self, cycles: Iterable[LiveCycle]) -> tuple[int, int]:
         """Return the number of cycles with a shadow, and the bytes that shadows sent over links.
@@ -695,3 +789,10 @@ def _between(before_ns: int, after_ns: int) -> int:
     """Difference of two counts; `UNKNOWN` if one is unknown or the counter has restarted."""
     known = UNKNOWN not in (before_ns, after_ns) and after_ns >= before_ns
     return after_ns - before_ns if known else UNKNOWN
+
+
+def _arrived(done: Completion) -> Iterator[str]:
+    """Yield the sources of the messages at which a cycle or shadow has ended."""
+    last = done.hops[-1] if done.hops else None
+    if last is not None and last.task == done.sink:
+        yield from (source for source, _ in last.inputs)

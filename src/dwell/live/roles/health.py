@@ -162,15 +162,20 @@ def _symptoms(
 ) -> Iterator[str]:
     """Yield the faults that the cell's cycles show, even if all processes are ready."""
     sinks = [role for role in members if role.kind == "sink"]
-    patience_ms = problem.guard_patience_ns / 1e6 + problem.pipeline.period_ms
-    limit_ms = max(patience_ms, problem.max_age_ms)
+    patience_ms, rates = problem.guard_patience_ns / 1e6, problem.pipeline.rates
     slow = list(_slow(problem, status))
     for role in sinks:
         sink = status["sinks"][role.task]
         age_ms = status["begun_ms"] if sink["applied_age_ms"] is None else sink["applied_age_ms"]
+        interval_ms = rates[role.task] * problem.pipeline.period_ms
+        limit_ms = max(patience_ms + interval_ms, problem.max_age_ms(role.task))
         if _heard(status, role) and age_ms > limit_ms:
             # The last outcome shows that the gate rejects the commands.
-            late = [*slow, _stale(problem, sink["stale_ms"])] if sink["outcome"] == STALE else []
+            late = (
+                [*slow, _stale(problem.max_age_ms(role.task), sink["stale_ms"])]
+                if sink["outcome"] == STALE
+                else []
+            )
             why = [*late, *_notes(status, [role.who])]
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent = status["recent"]
@@ -195,20 +200,22 @@ def _symptoms(
 
 
 def _slow(problem: Problem, status: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the stages that take longer than a period, and their replaced inputs."""
+    """Yield the stages that take longer than the time between jobs, and their replaced inputs."""
     for one in status["slow"]:
         lost = f": {one['replaced']} of {one['inputs']} inputs were replaced"
-        takes = f"{one['stage']} takes {one['exec_ms']:.0f} ms of {problem.pipeline.period_ms:.0f}"
+        task, _, _ = one["stage"].partition("@")
+        interval_ms = problem.pipeline.rates[task] * problem.pipeline.period_ms
+        takes = f"{one['stage']} takes {one['exec_ms']:.0f} ms of {interval_ms:.0f}"
         yield f"{takes}{lost if one['replaced'] else ''}"
 
 
-def _stale(problem: Problem, age_ms: float | None) -> str:
+def _stale(limit_ms: float, age_ms: float | None) -> str:
     """Return a reason for stale commands: their age, or only the comparison of clocks.
 
     `age_ms` is the age of the last stale command by the controller's clock alone, if known.
     """
-    limit = f"max_age_ms ({problem.max_age_ms:g})"
-    if age_ms is None or age_ms <= problem.max_age_ms:
+    limit = f"max_age_ms ({limit_ms:g})"
+    if age_ms is None or age_ms <= limit_ms:
         return f"by the clocks, commands are older than {limit} when they come"
     return f"commands are {age_ms:.0f} ms old when they come, more than {limit}"
 
@@ -220,8 +227,9 @@ def _uneven(problem: Problem, status: Mapping[str, Any], why: list[str]) -> Iter
     if ratio is not None and abs(ratio - 1) > live.degraded_at:
         every_ms = period_ms / ratio
         rates = f"{1e3 / every_ms:.3g} cycles a second of {1e3 / period_ms:.3g}"
-        if every_ms > problem.max_age_ms:
-            why = [f"cycles come every {every_ms:.0f} ms, max_age_ms is {problem.max_age_ms:g}"]
+        limit_ms = max(map(problem.max_age_ms, problem.pipeline.sinks))
+        if every_ms > limit_ms:
+            why = [f"cycles come every {every_ms:.0f} ms, max_age_ms is {limit_ms:g}"]
             yield f"{rates}{_because(why)}"
         else:
             yield rates

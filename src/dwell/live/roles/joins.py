@@ -17,11 +17,15 @@ Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
 
 @dataclass(slots=True)
 class Job:
-    """A complete set of inputs of one cycle; `header` is the header of one of them."""
+    """A complete set of inputs of one cycle; `header` is the header of one of them.
+
+    `values` are the inputs that the task samples, once a worker has taken the job.
+    """
 
     header: Header
     inputs: Inputs
     shadow: bool
+    values: Inputs = field(default_factory=dict)
 
     @property
     def arrived_ns(self) -> int:

@@ -12,7 +12,7 @@ round trip, and that the completion took the best way; any extra delay becomes p
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from dwell.live.wire.messages import Beat, Completion
@@ -52,10 +52,10 @@ class _Waiting:
 
 
 class Intervals:
-    """See the module; `node` is the stamper's."""
+    """See the module; `node` is the stamper's, and `sinks` returns the sinks due in a cycle."""
 
-    def __init__(self, node: str, sinks: Collection[str]) -> None:
-        self._node, self._sinks = node, frozenset(sinks)
+    def __init__(self, node: str, sinks: Callable[[int], frozenset[str]]) -> None:
+        self._node, self._sinks = node, sinks
         self._best = {node: _Best(0, 0)}
         self._waiting: dict[int, _Waiting] = {}
         self._unreported: list[tuple[int, int]] = []
@@ -89,7 +89,8 @@ class Intervals:
             waiting = self._waiting[cycle] = _Waiting()
             if len(self._waiting) > MOST_WAITING:
                 del self._waiting[min(self._waiting)]
-        if done.sink in waiting.said or done.sink not in self._sinks:
+        sinks = self._sinks(cycle)
+        if done.sink in waiting.said or done.sink not in sinks:
             return
         waiting.said.add(done.sink)
         back_ns = self.return_ns(done.node) if direct else None
@@ -97,7 +98,7 @@ class Intervals:
             waiting.known = False
         else:
             waiting.end_ns = max(waiting.end_ns, now_ns - back_ns)
-        if waiting.known and waiting.said == self._sinks:
+        if waiting.known and waiting.said == sinks:
             self._unreported.append((cycle, max(waiting.end_ns - done.stamp.released_ns, 0)))
             del self._unreported[:-MOST_REPORTED]
 

@@ -13,7 +13,8 @@ stamper, and the next decision records them. Overdue decisions are missed.
 Messages may be lost, late or doubled. A stamp or a completion makes a cycle known. An unknown cycle
 between two known cycles counts as released between them. Completions of this cycle and of the cycle
 before it may be lost; without a report neither counts, and the window is unproven. Numbers that a
-restarted stamper has skipped were never cycles: too little time has passed for them.
+restarted stamper has skipped were never cycles: too little time has passed for them. Cycles in
+which no sink is due count in windows, but not in their metrics.
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ class LiveWindows:
         cycle = self._note(completion.stamp, at_ns)
         if cycle is None or not cycle.take(completion, at_ns):
             return
-        if at_ns is not None and completion.sink in cycle.heard_ns:
+        if at_ns is not None and cycle.reports.get(completion.sink) is completion:
             self._symptoms.completed(completion, at_ns)
         if self._ledger.complete(cycle):
             self.record.newest_done = max(self.record.newest_done, cycle.key)
@@ -279,7 +280,7 @@ class LiveWindows:
             self.origin_ns = stamp.released_ns
         if self._newest is not None:
             self._follow(*self._newest, stamp, at_ns)
-        cycle = LiveCycle.of(stamp, self.origin_ns)
+        cycle = LiveCycle.of(stamp, self.origin_ns, idle=self._ledger.due.is_idle(stamp.cycle))
         line = self._line
         if line:
             for other in self._between(line[-1], cycle):
@@ -318,14 +319,17 @@ class LiveWindows:
             return
         if least <= span_ns <= most:
             for step in range(1, steps):
-                who = last.run, last.number + step, last.term, last.placement, ""
+                number = last.number + step
+                who = last.run, number, last.term, last.placement, ""
                 at_ns = last.at_ns + span_ns * step // steps
-                yield LiveCycle(*who, at_ns, last.origin_ns, heard=False)
+                idle = self._ledger.due.is_idle(number)
+                yield LiveCycle(*who, at_ns, last.origin_ns, heard=False, idle=idle)
 
     def _insert(self, stamp: Stamp) -> LiveCycle | None:
         """Insert a cycle whose number seemed to have been skipped, if its release fits."""
         line = self._line
-        cycle = LiveCycle.of(stamp, line[-1].origin_ns)
+        idle = self._ledger.due.is_idle(stamp.cycle)
+        cycle = LiveCycle.of(stamp, line[-1].origin_ns, idle=idle)
         place = bisect.bisect(line, cycle.key, key=lambda other: other.key)
         if not line[place - 1].at_ns <= cycle.at_ns <= line[place].at_ns:
             self.ignored += 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar, cast
 
 import msgspec
 
@@ -18,6 +18,7 @@ from dwell.live.wire.channels import CHANNELS, RELAYED
 from dwell.live.wire.keys import Channel, Keys
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
+    RATED,
     SIGNATURE_BYTES,
     Beat,
     Beats,
@@ -131,12 +132,16 @@ class RolePlace:
     #: Keys of its cell, and P.
     keys: Keys = field(init=False)
     period_ns: int = field(init=False)
+    #: Whether jobs have origins, in a cell with sampled flows or chains.
+    has_origins: bool = field(init=False)
 
     def __post_init__(self) -> None:
         phase_ms = self.problem.pipeline.first_release_ms
         require(phase_ms == 0, "phase_ms", phase_ms, "0 in a live cell, which begins when it is up")
         self.keys = Keys(self.problem.name)
-        self.period_ns = self.problem.pipeline.period_ns
+        pipeline = self.problem.pipeline
+        self.period_ns = pipeline.period_ns
+        self.has_origins = bool(pipeline.chains) or any(flow.sampled for flow in pipeline.flows)
 
     @property
     def patience_ns(self) -> int:
@@ -191,7 +196,12 @@ class RolePlace:
     def _decoded(self, channel: Channel[T], sample: Arrival) -> T:
         """Decode a message without a check of its signature."""
         signed = self.seals is not None and channel.signer is not None
-        return decode(sample.payload[SIGNATURE_BYTES if signed else 0 :], channel.payload)
+        payload = sample.payload[SIGNATURE_BYTES if signed else 0 :]
+        return decode(payload, self.kind_of(channel.payload))
+
+    def kind_of(self, kind: type[T]) -> type[T]:
+        """Return the type of a message in this cell."""
+        return cast("type[T]", RATED.get(kind, kind)) if self.has_origins else kind
 
     def _require_signer(self, channel: Channel[T], sample: Arrival, message: T) -> None:
         """Raise a LiveError unless the channel's signer has signed a message, if there are keys."""
@@ -222,7 +232,7 @@ class RolePlace:
         names = {self.stamper[0]}
         if not header.stamp.term:
             pipeline = self.problem.pipeline
-            sources = (task for name, task in pipeline.tasks.items() if not pipeline.inputs(name))
+            sources = (task for name, task in pipeline.tasks.items() if not pipeline.waited(name))
             names = {node for task in sources for node in task.on} - names
         sealed = header.seal + encode(header.stamp)
         for name in names:
@@ -310,7 +320,7 @@ class RolePlace:
         all later cycles at the actuator.
         """
         try:
-            header = decode(sample.header, Header, limit=MAX_HEADER_BYTES)
+            header = decode(sample.header, self.kind_of(Header), limit=MAX_HEADER_BYTES)
             if self.seals is not None:
                 self._require_stamped(self.seals, header)
             return header

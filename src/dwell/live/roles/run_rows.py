@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import takewhile
 from typing import Any, TypeAlias
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dwell.control import Controller, Proposal, final_l95_ms
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
+from dwell.live.roles.data_ages import DataAges
 from dwell.live.roles.loads import ProcessLoads
 from dwell.live.roles.offsets import UNBOUNDED_NS
 from dwell.live.wire.messages import NOT_APPLIED
@@ -64,6 +65,8 @@ class LiveWindow:
         Whether the bound exceeds 20 % of D, or the outcome of a cycle is unknown.
     rate_at_close : float
         V_D as known at the end of the window.
+    known_origins : dict of str to int
+        Release of the last origin before the window, by chain.
     used : float64 array, shape (3, resources)
         Utilisation by all work, by the cell's jobs, and by shadows.
     seen : tuple of float or None
@@ -82,6 +85,7 @@ class LiveWindow:
     used: NDArray[np.float64]
     closed_unix_ns: int | None
     seen: tuple[float | None, ...] = (None, None, None)
+    known_origins: Mapping[str, int] = field(default_factory=dict)
 
     def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
         """Return a proposal and its cycles for the status."""
@@ -146,6 +150,7 @@ class RunRows:
     ) -> None:
         self._controller, self._ledger, self._processes = controller, ledger, processes
         problem = controller.problem
+        self._ages = DataAges(problem, ledger)
         self._nodes, self._size = tuple(problem.fabric.nodes), problem.window_cycles
         self._warmup_windows, self._kept = problem.warmup_windows, kept
         self._deadline_ns = problem.pipeline.deadline_ns
@@ -179,6 +184,8 @@ class RunRows:
 
     def close(self, window: LiveWindow) -> None:
         """Record a window."""
+        window.known_origins = self._ages.known
+        self._ages.closed(window.cycles)
         self._windows[window.number] = window
         self._changed_windows.add(window.number)
         if self._jobs:
@@ -224,11 +231,13 @@ class RunRows:
         return isinstance(last, int) and last < self.next_row
 
     def _outcome(self, cycle: LiveCycle) -> str:
+        if cycle.idle:
+            return "idle"
         if cycle.came_to(NOT_APPLIED):
             return NOT_APPLIED
         if self._ledger.complete(cycle) or cycle.told:
             return "done"
-        if cycle.replaced:
+        if self._ledger.is_replaced(cycle):
             return "replaced"
         return "dropped" if cycle.key < self.newest_done else "in_flight"
 
@@ -277,6 +286,7 @@ class RunRows:
             "seen_violation_rate": seen_violation_rate,
             **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
             "cost": cost,
+            **self._ages.values(cycles, window.known_origins),
             "overtaken": sum(cycle.overtaken for cycle in cycles),
             "term": cycles[-1].term,
             "lead": window.lead,

@@ -45,7 +45,7 @@ class Sink:
     ) -> None:
         self.place, self.task, self.actuator = place, task, actuator
         self._highest = highest
-        self.max_age_ns = round(place.problem.max_age_ms * 1e6)
+        self.max_age_ns = round(place.problem.max_age_ms(task) * 1e6)
         self.newest = highest.load()
         self.offsets = place.offsets()
         #: CPU time that this process's control group has used, if the kernel counts it.

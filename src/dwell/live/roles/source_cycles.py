@@ -14,12 +14,13 @@ class SourceCycles:
     """Stamps of a source task; each waits for the instant at which its cycle begins here.
 
     If the source's node is not the stamper's, stamps arrive one cycle early. If a stamp is missing
-    and cycles are released by a timer, the source guesses up to g stamps in a row.
+    and cycles are released by a timer, the source guesses stamps for up to g cycles, at least one.
     """
 
-    def __init__(self, place: RolePlace, offsets: Offsets, offset_ns: int) -> None:
+    def __init__(self, place: RolePlace, offsets: Offsets, offset_ns: int, rate: int) -> None:
         self._place, self._offsets, self._offset_ns = place, offsets, offset_ns
-        self._guesses = place.problem.controller.guard_cycles
+        self._rate = rate
+        self._guesses = max(place.problem.controller.guard_cycles // rate, 1)
         self._alone = place.node != place.stamper[0] and place.problem.live.release == "timer"
         self._waiting: dict[tuple[int, int], tuple[Header, int]] = {}
         self._last: Header | None = None
@@ -48,7 +49,8 @@ class SourceCycles:
         if self._last is None or not self._alone or self._guessed >= self._guesses:
             return NEVER_NS
         period_ns = self._place.period_ns
-        return self._begins_ns(self._last) + self._offset_ns + period_ns + period_ns // 4
+        begins_ns = self._begins_ns(self._last) + self._rate * period_ns
+        return begins_ns + self._offset_ns + period_ns // 4
 
     def due(self, now_ns: int) -> Job | None:
         """Return the job of the cycle that begins now; None if no cycle does."""
@@ -59,8 +61,9 @@ class SourceCycles:
             self._guessed = 0
         elif self._last is not None:
             before, at_ns = self._last.stamp, now_ns
-            released_ns = before.released_ns + self._place.period_ns
-            guess = Stamp(before.run, before.cycle + 1, 0, before.placement, released_ns)
+            released_ns = before.released_ns + self._rate * self._place.period_ns
+            cycle = before.cycle + self._rate
+            guess = Stamp(before.run, cycle, 0, before.placement, released_ns)
             seal = self._place.stamped(guess)
             header = Header(guess, STAMPER, self._place.node, "none", seal=seal)
             self._guessed += 1

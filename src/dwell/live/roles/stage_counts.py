@@ -189,6 +189,13 @@ class StageTable:
 
     def __init__(self, problem: Problem) -> None:
         self._size, self._period_ns = block_cycles(problem), problem.pipeline.period_ns
+        self._rates = problem.pipeline.rates
+        # Jobs of the source per message of a flow.
+        self._jobs_per_message = {
+            (flow.source, flow.target): problem.pipeline.message_rate(flow)
+            // self._rates[flow.source]
+            for flow in problem.pipeline.flows
+        }
         #: Time after the report of a sent message until the message counts as lost if it has not
         #: arrived: D, plus the time until the receiver's next report.
         self._settled_ns = problem.pipeline.deadline_ns + 5 * REPORT_NS // 4
@@ -222,20 +229,22 @@ class StageTable:
                 del self._sent_ns[key, who]
 
     def slow(self, placement: Placement, newest: Key) -> Iterator[dict[str, Any]]:
-        """Yield the stages of a placement whose median job takes longer than a period."""
-        for name in (f"{task}@{node}" for task, node in placement.items()):
+        """Yield the stages of a placement whose median job takes longer than from job to job."""
+        for task, node in placement.items():
+            name = f"{task}@{node}"
             one = next(self._recent(name, newest), None)
-            if one is not None and one.median_ns > self._period_ns:
+            if one is not None and one.median_ns > self._rates[task] * self._period_ns:
                 inputs = one.jobs + one.replaced + one.dropped
                 took = {"stage": name, "exec_ms": one.median_ns / 1e6}
                 yield {**took, "replaced": one.replaced, "inputs": inputs}
 
     def withholds(self, source: str, target: str, newest: Key) -> bool:
         """Whether recent jobs of ``TASK@NODE`` have ended without an output to a task."""
+        share = self._jobs_per_message[source.partition("@")[0], target]
         for one in self._recent(source, newest):
             outputs = (end for end in one.outputs if end.target.partition("@")[0] == target)
             # The agent may have read the rows between a job's end and its output.
-            if one.jobs > 1 + sum(end.sent for end in outputs):
+            if one.jobs > share * (1 + sum(end.sent for end in outputs)):
                 return True
         return False
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,6 +13,7 @@ from dwell.control import CellGuard, shadow_stamps
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
 from dwell.live.roles.latencies import Intervals
+from dwell.live.roles.origins import last_job, origin_of
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.wire import channels
 from dwell.live.wire.continuity import CLAIMS, RESERVED, RunClaims, SetbackDetector
@@ -112,11 +114,11 @@ class Stamper:
         self._early = any(node != place.node for _, node, _ in self._sources())
         self._ahead: Stamp | None = None
         self._names = tuple(problem.candidates)
-        self._sinks = frozenset(
-            name for name in problem.pipeline.tasks if not problem.pipeline.outputs(name)
-        )
-        self.intervals = Intervals(place.node, self._sinks)
+        self._due = self.routes.due
+        self.intervals = Intervals(place.node, self._due.sinks)
+        # Tasks that have reported cycles, and shadows, of which others have not.
         self._partial: dict[int, set[str]] = {}
+        self._partial_shadows: dict[int, set[str]] = {}
         self._open = problem.pipeline.open_cycles
         self.shadow_fraction = 0.0
         self.forks: tuple[tuple[str, str], ...] = ()
@@ -130,6 +132,8 @@ class Stamper:
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
         self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
+        # Placement before the first of these moves.
+        self._first = entry.placement
 
     @property
     def run(self) -> int:
@@ -217,7 +221,7 @@ class Stamper:
         if not self._unsure or not self._claims.believed(who, run) or run <= self.run:
             return
         self._ahead, self._answered = None, None
-        self._partial.clear()
+        self._forget_reports()
         # Cycles of the previous run never complete: processes downstream know a later run.
         self.guard.restart()
         self.guard.failures.restart()
@@ -229,22 +233,37 @@ class Stamper:
         if stamp.run != self.run:
             return
         if done.outcome == "shadow":
-            if done.sink in self._sinks and stamp.shadow in self._names:
+            ends = self.routes.shadow_ends(stamp)
+            if _reported_by_all(self._partial_shadows, done, ends):
                 self.guard.shadow_arrived(stamp.cycle, now_ns, stamp.shadow)
             return
+        self._acted(done)
         # A command that the actuator refused counts: the placement has delivered it.
-        handed_over = done.outcome in HANDED_OVER and done.sink in self._sinks
-        if not handed_over or stamp.cycle <= self.guard.newest - self._open:
+        if done.outcome not in HANDED_OVER or stamp.cycle <= self.guard.newest - self._open:
             return
-        sinks = self._partial.setdefault(stamp.cycle, set())
-        if done.sink in sinks:
-            return
-        sinks.add(done.sink)
-        if sinks == self._sinks:
+        if _reported_by_all(self._partial, done, self._due.sinks(stamp.cycle)):
             self._complete(stamp, now_ns)
-        if len(self._partial) > MAX_PARTIAL:
-            for cycle in sorted(self._partial)[: MAX_PARTIAL // 2]:
-                del self._partial[cycle]
+
+    def _acted(self, done: Completion) -> None:
+        """Report the actuations of guarded chains, with their origins, to the guard."""
+        for name in self.guard.chains:
+            chain = self.place.problem.pipeline.chains[name]
+            is_sink = chain.target in self.place.problem.pipeline.sinks
+            if is_sink and (done.sink != chain.target or done.outcome not in HANDED_OVER):
+                continue
+            origin = origin_of(last_job(done, chain.target), chain.source)
+            if origin is not None:
+                self.guard.acted(name, origin.cycle, self._placed(origin.cycle))
+
+    def _placed(self, cycle: int) -> str:
+        """Return the placement of a stamped cycle."""
+        place = bisect.bisect(self.moves, cycle, key=lambda move: move[0])
+        return self.moves[place - 1][1] if place else self._first
+
+    def _forget_reports(self) -> None:
+        """Forget the reports of cycles and shadows that have not completed."""
+        self._partial.clear()
+        self._partial_shadows.clear()
 
     def _complete(self, stamp: Stamp, now_ns: int) -> None:
         """Record a cycle whose commands have reached all sinks."""
@@ -356,8 +375,10 @@ class Stamper:
             # The next order of the controller sets the shadow fraction of the fallback.
             self.shadow_fraction = 0.0
         self.moves.append((self._next, placement, "guard" if by_guard else "order"))
+        for move in self.moves[:-1_000]:
+            self._first = move[1]
         del self.moves[:-1_000]
-        self._partial.clear()
+        self._forget_reports()
         self.guard.adopt(placement, fallback=by_guard)
         self.course.enter(self.run, self.term + 1)
         self._write()
@@ -435,7 +456,7 @@ class Stamper:
     def _gates(self) -> Iterator[str]:
         """Yield the names of the sinks' processes of the current placement."""
         placed = self.place.problem.candidates[self.placement]
-        return (f"sink.{task}@{placed[task]}" for task in self._sinks)
+        return (f"sink.{task}@{placed[task]}" for task in self.place.problem.pipeline.sinks)
 
     def _release(self, released_ns: int, now_ns: int) -> None:
         """Stamp a cycle and send it to the source tasks."""
@@ -448,7 +469,7 @@ class Stamper:
         stamp = early or self._stamp(self.cycle, released_ns)
         self.cycle += 1
         self.guard.sent(stamp.cycle, released_ns, stamp.placement)
-        if stamp.shadow:
+        if self.routes.shadow_ends(stamp):
             self.guard.shadow_sent(stamp.cycle, released_ns, stamp.shadow)
         self._send(stamp, here=True, elsewhere=early is None)
         intervals = self.intervals.take_unreported()
@@ -493,3 +514,20 @@ class Stamper:
 
     def _holds(self) -> BeatState:
         return BeatState(self.course.term, self.course.placement)
+
+
+def _reported_by_all(
+    partial: dict[int, set[str]], done: Completion, expected: frozenset[str]
+) -> bool:
+    """Add a report of a cycle; return whether it is the last of the expected reports."""
+    if done.sink not in expected:
+        return False
+    cycle = done.stamp.cycle
+    reported = partial.setdefault(cycle, set())
+    if done.sink in reported:
+        return False
+    reported.add(done.sink)
+    if len(partial) > MAX_PARTIAL:
+        for old in sorted(partial)[: MAX_PARTIAL // 2]:
+            del partial[old]
+    return reported == expected

@@ -57,6 +57,7 @@ class StateTransfer:
     ) -> None:
         self.place, self.task, self.stage, self._failed = place, task, stage, failed
         declared = place.problem.pipeline.tasks[task]
+        self._rate = place.problem.pipeline.rates[task]
         self._state_bytes, self._nodes = declared.state_bytes, frozenset(declared.on)
         self.stateful = stage.stateful and not shadow
         #: Request for the state here, and request for a state to be sent here.
@@ -113,7 +114,7 @@ class StateTransfer:
     def next_chore(self) -> Chore | None:
         """Return the chore before the next job; `call` and `finish` must follow."""
         asked = self.asked
-        if asked is not None and self.at >= (asked.run, asked.cycle - 1):
+        if asked is not None and self.at >= self._last_before(asked):
             self.asked, chore = None, Chore((asked.to,), asked.number)
         elif (found := self._restoring) is not None:
             self.awaited = None
@@ -157,7 +158,12 @@ class StateTransfer:
         found = None if asked is None else self._answers.get(asked.node)
         if asked is None or found is None or found[0].number != asked.number:
             return None
-        return found if (asked.run, asked.cycle - 1) <= found[0].key <= self._newest else None
+        return found if self._last_before(asked) <= found[0].key <= self._newest else None
+
+    def _last_before(self, asked: Snapshot) -> tuple[int, int]:
+        """Run and cycle of the last job before the first forked one."""
+        last = asked.cycle - 1
+        return asked.run, last - last % self._rate
 
     def call(self, chore: Chore) -> tuple[bytes, str]:
         """Call the stage; return the snapshot, and the error or an empty string."""
@@ -254,9 +260,10 @@ class StateTransfer:
         return self._cost_ns > self.place.problem.guard_patience_ns
 
     def plan_checkpoint(self, job: Job, now_ns: int) -> None:
-        """Plan a checkpoint every `checkpoint_cycles`, if they use at most 1/20 of the time."""
+        """Plan a checkpoint every `checkpoint_cycles` jobs, for at most 1/20 of the time."""
         nodes = self._checkpoint_nodes
-        if not nodes or job.header.stamp.cycle % self.place.problem.live.checkpoint_cycles:
+        number = job.header.stamp.cycle // self._rate
+        if not nodes or number % self.place.problem.live.checkpoint_cycles:
             return
         rests = 0 <= now_ns - self._snapshot_ns < CHECKPOINT_SPACING * self._cost_ns
         if not (rests or self._too_slow):

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from dwell.live.roles.cycle_ledger import SHADOW, Ledger, LiveCycle
+from dwell.live.roles.cycle_ledger import Ledger, LiveCycle
 from dwell.live.roles.run_rows import LiveWindow
 from dwell.live.wire.messages import ACTUATED, STALE, Completion
 from dwell.model import Problem
@@ -125,7 +125,12 @@ class Symptoms:
         return None if span_ns < window_ns else count * self._period_ns / span_ns
 
     def _is_applied(self, cycle: LiveCycle) -> bool:
-        """Whether its command was applied, or was in time and overtaken by a later command."""
+        """Whether its command was applied, or was in time and overtaken by a later command.
+
+        An idle cycle has no command.
+        """
+        if cycle.idle:
+            return True
         in_time = cycle.overtaken and not cycle.missed(self._deadline_ns)
         return cycle.told or ((cycle.actuated or in_time) and self._ledger.complete(cycle))
 
@@ -183,7 +188,10 @@ class Symptoms:
             known = fails.get(cycle.shadow)
             if known is None and place >= SILENT_WINDOWS * self._size:
                 continue
-            if any(s.outcome == SHADOW and s.sink in self._ledger.sinks for s in cycle.shadows):
+            ends = self._ledger.shadow_ends(cycle)
+            if not ends:
+                continue
+            if ends <= {shadow.sink for shadow in cycle.shadows}:
                 succeeded.add(cycle.shadow)
             elif known is None:
                 fails[cycle.shadow] = [cycle]

@@ -6,10 +6,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 
+from msgspec.structs import asdict
+
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN, Counts
 from dwell.live.roles.joins import MAX_JOINS, Job, Joins
+from dwell.live.roles.origins import oldest_origins, origins_of
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
+from dwell.live.roles.sampled_inputs import SampledInputs
 from dwell.live.roles.source_cycles import SourceCycles
 from dwell.live.roles.stage_counts import DROPPED, REPLACED, TAKEN, StageBook
 from dwell.live.roles.state_transfer import Chore, StateTransfer, too_long
@@ -17,9 +21,12 @@ from dwell.live.stage import CellStage, Message
 from dwell.live.wire import channels
 from dwell.live.wire.keys import MAIN, SHADOW
 from dwell.live.wire.messages import (
+    SAMPLED,
     Completion,
     Header,
     Hop,
+    Origin,
+    RatedHop,
     Rates,
     encode,
 )
@@ -27,6 +34,7 @@ from dwell.live.wire.payloads import read_payload, write_payload
 from dwell.live.wire.routing import STAMPER, Routes
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import lane_of, longest_bytes
+from dwell.model import FrozenDict
 from dwell.model.instants import EVIDENCE_NS
 
 #: Periods between two beats of a shadow worker.
@@ -65,7 +73,11 @@ class Worker:
         self._output_bytes = {f.target: f.payload_bytes for f in problem.pipeline.outputs(task)}
         self._state_bytes = problem.pipeline.tasks[task].state_bytes
         self._nodes = frozenset(problem.pipeline.tasks[task].on)
-        sources = frozenset(self._input_bytes) or frozenset([STAMPER])
+        #: Inputs that the task does not wait for.
+        forwards = not (shadow or stands_by)
+        self.samples = SampledInputs(place, task, forwards=forwards)
+        waited = frozenset(self._input_bytes) - self.samples.sources
+        sources = waited or frozenset([STAMPER])
         #: Whether frames of this stage start the cycles; only frames of the first source do.
         first = next(name for name in problem.pipeline.tasks if not problem.pipeline.inputs(name))
         frames = problem.live.release == "frames" and task == first
@@ -90,7 +102,16 @@ class Worker:
         self._counted: tuple[Counts, int, Counts] = NOT_COUNTED
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
-        self._source = SourceCycles(place, self.offsets, offset_ns) if STAMPER in sources else None
+        rate = self.routes.due.rates[task]
+        self._source = (
+            SourceCycles(place, self.offsets, offset_ns, rate) if STAMPER in sources else None
+        )
+        # Whether chains and samples count the age of data from its cycles.
+        chains = problem.pipeline.chains.values()
+        firsts = {*self.routes.due.sources, *(chain.source for chain in chains)}
+        self._is_origin = place.has_origins and task in firsts
+        #: Time from one job to the next.
+        self._interval_ns = rate * place.period_ns
         #: State of the stage, which moves with the task.
         self.transfer = StateTransfer(place, task, stage, self._failed, shadow=shadow)
         self.started = False
@@ -106,7 +127,7 @@ class Worker:
         # Sender of each link that the inputs may take. The stamper's beats compare the clocks.
         before = [
             (node, f"{source}@{node}")
-            for source in sources - {STAMPER}
+            for source in self._input_bytes
             for node in problem.pipeline.tasks[source].on
             if node != place.node
         ]
@@ -128,9 +149,10 @@ class Worker:
             yield keys.of(channels.INPUT, self.task, node, SHADOW)
             return
         yield keys.of(channels.INPUT, self.task, node, MAIN)
-        if self.is_sink:
+        if self.is_sink or self.samples.sources:
             yield keys.of(channels.INPUT, self.task, node, SHADOW)
         yield from self.transfer.subscriptions()
+        yield from self.samples.subscriptions()
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a message."""
@@ -140,11 +162,15 @@ class Worker:
         kind = sample.key.rpartition("/")[2]
         if kind in (MAIN, SHADOW) and "/in/" in sample.key:
             self._input(sample, kind, now_ns)
-        elif "/snapshot/" in sample.key or "/state/" in sample.key:
-            try:
-                self.transfer.receive(sample)
-            except LiveError as error:
-                self.place.complain(error)
+            return
+        try:
+            match self.place.channel(sample):
+                case channels.SNAPSHOT | channels.STATE:
+                    self.transfer.receive(sample)
+                case channels.STAMPED | channels.VALUE:
+                    self.samples.receive(sample, now_ns)
+        except LiveError as error:
+            self.place.complain(error)
 
     def _input(self, sample: Arrival, kind: str, now_ns: int) -> None:
         header = self.place.header(sample)
@@ -155,6 +181,10 @@ class Worker:
         if header.source == STAMPER and self._source is not None:
             self._source.stamped(header, now_ns)
             return
+        sampled = header.source in self.samples.sources
+        # The shadow worker takes what its jobs wait for; this worker reports the rest.
+        if kind == SHADOW and sampled == self.shadow and not self.is_sink:
+            return
         if kind == MAIN and not self.stands_by:
             self.book.arrived(header)
         declared = self._input_bytes.get(header.source)
@@ -163,6 +193,9 @@ class Worker:
             what = f"{len(sample.payload)} bytes from {header.source}; at most {longest} are taken"
             self.place.complain(LiveError(f"{self.task} on {self.place.node}: {what}"))
             self._joins[kind].drop([header])
+            return
+        if sampled:
+            self._sample(header, sample.payload, kind, now_ns)
             return
         complete = self._joins[kind].add(header, sample.payload, now_ns)
         if complete is None:
@@ -182,6 +215,22 @@ class Worker:
                 # Of the oldest waiting job and the new job, the earlier cycle.
                 overtaken = job.order < self._jobs[0].order
                 self._replace(self._jobs.pop() if overtaken else self._jobs.popleft())
+
+    def _sample(self, header: Header, payload: bytes, kind: str, now_ns: int) -> None:
+        """Take a sampled message; report its arrival, with all jobs upstream of it."""
+        outcome = "shadow"
+        if kind == MAIN:
+            outcome = SAMPLED
+            is_newest = self.samples.take(header, payload, now_ns)
+            self.book.ended([header], TAKEN if is_newest else DROPPED)
+        stamp, place = header.stamp, self.place
+        is_here = kind == SHADOW or self.routes.runs(self.task, place.node, stamp)
+        if is_here and not self.stands_by:
+            times = now_ns, UNKNOWN, UNKNOWN
+            here = Hop(self.task, place.node, *times, ((header.source, now_ns),))
+            hops = (*header.hops, here)
+            ended = Completion(stamp, self.task, now_ns, outcome, hops, place.node)
+            place.send(channels.ENDED, ended)
 
     def _replace(self, job: Job) -> None:
         """Report a job that a later cycle has replaced."""
@@ -279,7 +328,7 @@ class Worker:
             # The restored state already contains this job.
             self._replace(self._jobs.popleft())
         if not self.active:
-            horizon_ns = now_ns - 2 * self.place.period_ns
+            horizon_ns = now_ns - 2 * self._interval_ns
             while self._jobs and self._jobs[0].arrived_ns < horizon_ns:
                 self._jobs.popleft()
             return None
@@ -290,6 +339,8 @@ class Worker:
     def _taken(self, job: Job, now_ns: int) -> Job:
         self.busy_since_ns = now_ns
         self._busy_cycle = job.header.stamp.cycle
+        if not (job.shadow or job.values):
+            job.values = self.samples.newest()
         if not job.shadow:
             self.book.ended(job.headers, TAKEN)
         return job
@@ -297,8 +348,10 @@ class Worker:
     def retry(self, shadow: bool, inputs: list[tuple[Header, bytes]], now_ns: int) -> None:
         """Put a job that another process has not finished at the head of the queue."""
         if inputs:
-            by_source = {header.source: (header, data, now_ns) for header, data in inputs}
-            self._jobs.appendleft(Job(inputs[0][0], by_source, shadow))
+            given = {header.source: (header, data, now_ns) for header, data in inputs}
+            values = {name: one for name, one in given.items() if name in self.samples.sources}
+            waited = {name: one for name, one in given.items() if name not in values}
+            self._jobs.appendleft(Job(inputs[0][0], waited, shadow, values))
 
     def run(self, job: Job, started_ns: int) -> tuple[Message | None, int]:
         """Call the stage; return its output (None if it failed) and the age of its checkpoint.
@@ -311,16 +364,10 @@ class Worker:
         stamp = job.header.stamp
         self._counted = NOT_COUNTED
         state_age = self.transfer.recover(job) if self.transfer.stateful else UNKNOWN
-        released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
         try:
             inputs = {
-                source: Message(
-                    read_payload(header.kind, payload, self.stage.inputs.get(source)),
-                    stamp.cycle,
-                    released_ns,
-                    (started_ns - released_ns) / 1e6,
-                )
-                for source, (header, payload, _) in job.inputs.items()
+                source: self._message(source, header, payload, started_ns)
+                for source, (header, payload, _) in (*job.inputs.items(), *job.values.items())
             }
             try:
                 output = self.stage.process(inputs)
@@ -335,6 +382,15 @@ class Worker:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return None, state_age
         return output, state_age
+
+    def _message(self, source: str, header: Header, payload: bytes, started_ns: int) -> Message:
+        """Return an input of a stage that is called at `started_ns`."""
+        stamp = header.stamp
+        released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
+        data = read_payload(header.kind, payload, self.stage.inputs.get(source))
+        origins = {one.task: one.cycle for one in origins_of(header)}
+        age_ms = (started_ns - released_ns) / 1e6
+        return Message(data, stamp.cycle, released_ns, age_ms, origins=FrozenDict(origins))
 
     def finish(
         self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1
@@ -368,6 +424,8 @@ class Worker:
         group_ns = before.group_ns, after.group_ns
         stamp_ns, here = output.stamp_ns, (self.task, place.node)
         hop = Hop(*here, *times, inputs, state_age, *spent, group_ns, warmup, stamp_ns)
+        if place.has_origins:
+            hop = RatedHop(**asdict(hop), origins=self._origins(job))
         seal, hops = job.header.seal, (*job.hops(), hop)
         header = Header(stamp, self.task, place.node, kind, hops, job.shadow, seal)
         head = encode(header)
@@ -392,6 +450,14 @@ class Worker:
                     self.book.sent(stamp, f"{target}@{node}", len(data))
             self.transfer.plan_checkpoint(job, ended_ns)
 
+    def _origins(self, job: Job) -> tuple[Origin, ...]:
+        """Return the oldest cycles from which a job descends."""
+        headers = (header for header, _, _ in (*job.inputs.values(), *job.values.values()))
+        origins, stamp = oldest_origins(headers), job.header.stamp
+        if self._is_origin:
+            origins[self.task] = Origin(self.task, stamp.cycle, stamp.released_ns)
+        return tuple(origins.values())
+
     def framed(self, now_ns: int) -> None:
         """Request a cycle from the stamper, because the source has a frame."""
         self._framed_ns = now_ns
@@ -413,7 +479,7 @@ class Worker:
 
     def _state(self) -> tuple[bool, str]:
         where = f"{self.task} on {self.place.node}"
-        limit_ns = self.place.hang_ns
+        limit_ns = max(self.place.hang_ns, 10 * self._interval_ns)
         if self.busy_since_ns is not None:
             busy_ns, chore = self._now_ns - self.busy_since_ns, self._chore
             call = f"cycle {self._busy_cycle}: process()" if chore is None else chore.call

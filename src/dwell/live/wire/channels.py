@@ -66,9 +66,11 @@ def _from_upstream(problem: Problem) -> Senders:
     for name, task in pipeline.tasks.items():
         flows = pipeline.inputs(name)
         before = {node for flow in flows for node in pipeline.tasks[flow.source].on}
+        if not pipeline.waited(name):
+            before.add(problem.stamper_node)
         for kind in (MAIN, SHADOW) if flows else (MAIN,):
             for node in task.on:
-                yield (name, node, kind), before or [problem.stamper_node]
+                yield (name, node, kind), before
 
 
 def _from_sinks(problem: Problem) -> Senders:
@@ -94,6 +96,14 @@ def _moving(problem: Problem) -> Iterable[tuple[str, str, str]]:
     """Yield task, node and other node of each move of a state."""
     for name, task in problem.pipeline.tasks.items():
         yield from ((name, to, node) for to in task.on for node in task.on if to != node)
+
+
+def _old_nodes(problem: Problem) -> Senders:
+    """Yield the nodes that may forward values to another node of a task that samples them."""
+    sampling = {flow.target for flow in problem.pipeline.flows if flow.sampled}
+    for task, to, node in _moving(problem):
+        if task in sampling:
+            yield (task, to, node), [node]
 
 
 def _moved_to(problem: Problem) -> Senders:
@@ -153,6 +163,8 @@ LOAD = Channel("load", Load, _from_each_node, ("controller",), 1, _node, twice=T
 #: Request for a state, to both workers of its move.
 SNAPSHOT = Channel("snapshot", Snapshot, _moved_to, _WORKERS, 2, _controller)
 STATE = Channel("state", State, _moved_from, _WORKERS, 3)
+#: Newest value of a sampled flow, from an old node of its target. Its workers subscribe to it.
+VALUE = Channel("value", Header, _old_nodes, (), 3)
 RESTORED = Channel("restored", Restored, _movable, ("controller",), 0, _node)
 ASK = Channel("ask", Ask, _from_people, ("controller",))
 LOOK = Channel("look", Ask, _from_people, ("controller",))
@@ -166,7 +178,7 @@ CHANNELS: dict[str, Channel[Any]] = {
     channel.word: channel
     for channel in (
         *(INPUT, COMMAND, DONE, ENDED, BEAT, BEATS, MISSED, STAMPED, FRAME, ORDER, ACCEPTED, LOAD),
-        *(SNAPSHOT, STATE, RESTORED, ASK, LOOK, ANSWER, CARRIED, GATHERED),
+        *(SNAPSHOT, STATE, VALUE, RESTORED, ASK, LOOK, ANSWER, CARRIED, GATHERED),
     )
 }
 #: Channels on the detour.

@@ -21,6 +21,8 @@ MAX_CONTROL_BYTES = 262_144
 ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
 #: Outcome of a command that the gate stops, because it may be older than `max_age_ms`.
 STALE = "stale"
+#: Outcome of a job whose output a task has sampled: the output has arrived there.
+SAMPLED = "sampled"
 #: Outcome of a command that the gate stops, because it has passed a later cycle's command.
 BEHIND = "behind"
 #: Start of the refusal of an order while another controller is in charge.
@@ -135,6 +137,32 @@ class Hop(_Array, frozen=True):
     stamp_ns: Instant | None = None
 
 
+class Origin(_Array, frozen=True):
+    """A cycle from which a job descends, and its release on the stamper's clock.
+
+    `task` is a task that begins at a release, or the first task of a chain.
+    """
+
+    task: Name
+    cycle: Count
+    released_ns: Instant
+
+
+class RatedHop(Hop, frozen=True):
+    """A hop in a cell with sampled flows or chains.
+
+    Parameters
+    ----------
+    origins : tuple of Origin
+        Oldest cycles from which the job descends, one per task.
+    """
+
+    origins: Annotated[tuple[Origin, ...], msgspec.Meta(max_length=64)] = ()
+
+
+RatedHops: TypeAlias = Annotated[tuple[RatedHop, ...], msgspec.Meta(max_length=64)]
+
+
 class Header(_Array, frozen=True):
     """Sent with the payload of every message between stages.
 
@@ -163,6 +191,12 @@ class Header(_Array, frozen=True):
     seal: Annotated[bytes, msgspec.Meta(max_length=64)] = b""
 
 
+class RatedHeader(Header, frozen=True):
+    """A header in a cell with sampled flows or chains."""
+
+    hops: RatedHops = ()
+
+
 class Completion(_Array, frozen=True):
     """End of a cycle at a sink, or of one of its jobs before a sink.
 
@@ -173,7 +207,8 @@ class Completion(_Array, frozen=True):
     outcome : str
         ``actuated``, ``not_applied`` (the actuator raised), ``behind`` (a later cycle had been
         actuated), ``stale`` (older than `max_age_ms`); ``shadow`` at the end of a shadow;
-        ``replaced`` if a later cycle replaced the job.
+        ``replaced`` if a later cycle replaced the job; ``sampled`` if its output has arrived at a
+        task that does not wait for it.
     node : str
         Node of the sink or of the job.
     group_ns : int
@@ -191,6 +226,12 @@ class Completion(_Array, frozen=True):
     node: Name
     group_ns: Spent = -1
     rested: bool = False
+
+
+class RatedCompletion(Completion, frozen=True):
+    """A completion in a cell with sampled flows or chains."""
+
+    hops: RatedHops
 
 
 class Heard(_Array, frozen=True):
@@ -573,7 +614,13 @@ T = TypeVar("T", bound=msgspec.Struct)
 _ENCODER = msgspec.msgpack.Encoder()
 # Create all decoders here, in one thread: msgspec crashes if one thread decodes a message while
 # another thread creates a decoder for a type that both use.
-_KINDS: tuple[type[msgspec.Struct], ...] = (*_Array.__subclasses__(), Stamped)
+_MORE: tuple[type[msgspec.Struct], ...] = (Stamped, RatedHop, RatedHeader, RatedCompletion)
+_KINDS: tuple[type[msgspec.Struct], ...] = (*_Array.__subclasses__(), *_MORE)
+#: Types of messages in a cell with sampled flows or chains, in place of other types.
+RATED: dict[type[msgspec.Struct], type[msgspec.Struct]] = {
+    Header: RatedHeader,
+    Completion: RatedCompletion,
+}
 _DECODERS: dict[type[msgspec.Struct], msgspec.msgpack.Decoder[Any]] = {
     kind: msgspec.msgpack.Decoder(kind) for kind in _KINDS
 }

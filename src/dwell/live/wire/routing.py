@@ -8,7 +8,8 @@ from typing import NamedTuple
 from dwell.errors import LiveError
 from dwell.live.wire.keys import MAIN, SHADOW
 from dwell.live.wire.messages import Stamp
-from dwell.model import Problem
+from dwell.model import Flow, Problem
+from dwell.model.due_tasks import DueTasks
 
 #: Largest number of cached routes.
 MAX_KNOWN = 1_024
@@ -27,6 +28,8 @@ class Destination(NamedTuple):
 class Routes:
     """Destinations of every task's output; they depend only on the stamp.
 
+    A task gets messages in cycles in which it is due.
+
     A shadow shares the tasks that both placements run on the same nodes with the same inputs. From
     the first task on different nodes it has separate messages, down to the sinks' nodes.
     """
@@ -34,18 +37,33 @@ class Routes:
     def __init__(self, problem: Problem) -> None:
         self._candidates = problem.candidates
         self._pipeline = problem.pipeline
-        self._targets = {
-            name: tuple(flow.target for flow in problem.pipeline.outputs(name))
-            for name in problem.pipeline.tasks
+        #: Tasks that run in each cycle.
+        self.due = due = DueTasks(problem.pipeline)
+        self._outputs = {name: problem.pipeline.outputs(name) for name in problem.pipeline.tasks}
+        self._outputs[STAMPER] = tuple(Flow(STAMPER, name) for name in due.sources)
+        # Rates of messages, as far as some cycles have none.
+        rates = {
+            name: {due.rates[flow.source if flow.sampled else flow.target] for flow in flows}
+            for name, flows in self._outputs.items()
         }
-        sources = [name for name in problem.pipeline.tasks if not problem.pipeline.inputs(name)]
-        self._targets[STAMPER] = tuple(sources)
+        self._rates = {name: tuple(of - {1}) for name, of in rates.items()}
+        self._apart: dict[tuple[str, str], frozenset[str]] = {}
         self._known: dict[tuple[object, ...], tuple[Destination, ...]] = {}
 
     def runs(self, task: str, node: str, stamp: Stamp) -> bool:
         """Whether a task of a cycle runs on a node."""
         placement = self._candidates.get(stamp.placement)
         return placement is not None and placement[task] == node
+
+    def shadow_ends(self, stamp: Stamp) -> frozenset[str]:
+        """Return the tasks that report the end of a cycle's shadow; none without a shadow."""
+        active, other = (self._candidates.get(name) for name in (stamp.placement, stamp.shadow))
+        if active is None or other is None:
+            return frozenset()
+        pair = stamp.placement, stamp.shadow
+        if pair not in self._apart:
+            self._apart[pair] = self._pipeline.diverging(active, other)
+        return self.due.shadow_ends(self._apart[pair], stamp.cycle)
 
     def destinations(
         self, task: str, stamp: Stamp, *, shadow: bool = False
@@ -55,7 +73,8 @@ class Routes:
         `task` is the sender, `STAMPER` for the stamp itself. `shadow` is set for the output of a
         shadow. Raises a LiveError if the stamp's placement or shadow is not a candidate.
         """
-        key = (task, stamp.placement, stamp.shadow, stamp.forks, shadow, stamp.term == 0)
+        sends = tuple(stamp.cycle % rate == 0 for rate in self._rates[task])
+        key = (task, stamp.placement, stamp.shadow, stamp.forks, shadow, stamp.term == 0, sends)
         known = self._known.get(key)
         if known is None:
             self._check(stamp)
@@ -73,22 +92,26 @@ class Routes:
                 )
 
     def _routed(self, task: str, stamp: Stamp, shadow: bool) -> Iterable[Destination]:
+        sent = [flow for flow in self._outputs[task] if self.due.sends(flow, stamp.cycle)]
         if not stamp.term:
             # The stamp is a guess, so all workers that may run the target get the output.
-            for target in self._targets[task]:
-                for node in self._pipeline.tasks[target].on:
-                    yield Destination(target, node, MAIN)
+            for flow in sent:
+                for node in self._pipeline.tasks[flow.target].on:
+                    yield Destination(flow.target, node, MAIN)
             return
         active = self._candidates[stamp.placement]
         other = self._candidates.get(stamp.shadow) if stamp.shadow else None
         apart = self._pipeline.diverging(active, other) if other is not None else frozenset()
         # The cycle's tasks also send to the shadow, except for tasks that run twice.
         shares = shadow or task not in apart
-        for target in self._targets[task]:
+        for flow in sent:
+            target = flow.target
             if not shadow:
                 yield Destination(target, active[target], MAIN)
                 for forked, node in stamp.forks:
                     if forked == target and node in self._pipeline.tasks[target].on:
                         yield Destination(target, node, MAIN)
-            if other is not None and shares and target in apart:
+            # The shadow of a target that does not wait uses no message of a shared task.
+            to_shadow = shadow if flow.sampled else shares and target in apart
+            if other is not None and to_shadow:
                 yield Destination(target, other[target], SHADOW)

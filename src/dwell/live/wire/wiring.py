@@ -189,7 +189,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
-    _require_one_rate(problem)
+    _require_latencies(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -262,8 +262,8 @@ def longest_message_bytes(problem: Problem, session: Session) -> int:
 def session_of(entry: WiringEntry, lane: Lane, key: str) -> Session:
     """Return the session in which a process sends a message.
 
-    On the lane `images` keys are ``dwell/CELL/in/TASK/NODE/...`` or
-    ``dwell/CELL/state/TASK/NODE/...``; a message to the process's own node uses `local`. If the
+    On the lane `images` keys are ``dwell/CELL/in/TASK/NODE/...``, or have ``state`` or ``value``
+    instead of ``in``; a message to the process's own node uses `local`. If the
     process has no such session, the result is `control`: the message is slower, but not lost.
     """
     if lane == "images":
@@ -303,10 +303,11 @@ def _wires(problem: Problem, everybody: Sequence[Role]) -> list[tuple[Session, f
                     session = "local"
                 pairs[session, frozenset((one.who, other.who))] = None
     for task in problem.pipeline.tasks.values():
-        state = lane_of(task.state_bytes)
+        moved = [flow.payload_bytes for flow in problem.pipeline.inputs(task.name) if flow.sampled]
+        lanes = [lane_of(size) for size in (task.state_bytes, *moved)]
         for one, other in combinations(_workers(everybody, task.name), 2):
             if one.node != other.node:
-                pairs[state, frozenset((one.who, other.who))] = None
+                pairs.update(((lane, frozenset((one.who, other.who))), None) for lane in lanes)
     return list(pairs)
 
 
@@ -326,12 +327,13 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             return other.kind == "controller" or (other.works and other.task == one.task)
         case "standby":  # works only while its worker is silent
             return other.kind == "worker" and same_node and other.task == one.task
-        case "controller":  # receives completions, loads, ended shadows, restored states
+        case "controller":  # receives completions, loads, ended shadows, samples, states
             if not other.works:
                 return other.kind == "agent"
             task = problem.pipeline.tasks[other.task]
             stops = not problem.pipeline.outputs(other.task)
-            return stops or (other.kind == "worker" and not task.anchored)
+            samples = any(flow.sampled for flow in problem.pipeline.inputs(other.task))
+            return stops or (other.kind == "worker" and (samples or not task.anchored))
     return False
 
 
@@ -343,20 +345,18 @@ def require_candidates(problem: Problem) -> None:
         raise ProblemError([Fault("candidates.all", f"{message}; {remedy}")])
 
 
-def _require_one_rate(problem: Problem) -> None:
-    """Raise a LiveError if a task has a rate of its own, a flow is sampled, or a chain is given."""
-    pipeline = problem.pipeline
-    keys = [f"tasks.{name}.every" for name, task in pipeline.tasks.items() if task.every]
-    keys += [f"flows[{i}].sampled" for i, flow in enumerate(pipeline.flows) if flow.sampled]
-    keys += [f"chains.{name}" for name in pipeline.chains]
-    if keys:
-        raise LiveError(
-            "\n".join(
-                f"{key}: not supported in the live cell {problem.name}; only the simulator has "
-                "several rates and chains: remove it, or use dwell run"
-                for key in keys
-            )
-        )
+def _require_latencies(problem: Problem) -> None:
+    """Raise a LiveError if J needs ages, which live windows do not have."""
+    objective = problem.objective
+    keys = {"latency": objective.latency is not None, "weights.age": objective.weighs_age}
+    lines = [
+        f"objective.{key}: not supported in the live cell {problem.name}; only the simulator "
+        "measures ages: remove it, or use dwell run"
+        for key, there in keys.items()
+        if there
+    ]
+    if lines:
+        raise LiveError("\n".join(lines))
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:

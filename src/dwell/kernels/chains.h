@@ -1,0 +1,48 @@
+// Chains: the cycles from which jobs descend, and the ages of actuations.
+#pragma once
+
+#include <limits>
+
+#include "samples.h"
+
+namespace dwell {
+
+// Origin of a job that descends from no cycle of a chain's first task.
+constexpr i32 kNoOrigin = std::numeric_limits<i32>::max();
+
+// Finds the oldest cycle from which a job descends, per chain, when a worker takes the job.
+template <class S>
+void descend(S& s, i64 key) {
+  const i64 cell = cell_of(key), cycle = cycle_of(key), task = item_of(key);
+  const Cell& of = s.cell(cell);
+  for (i64 chain = 0; chain < of.n_chains; ++chain) {
+    i32& origin = s.origin(cell, cycle, task, chain);
+    if (s.chains[of.chain_0 + chain].source == task) {
+      origin = static_cast<i32>(cycle);
+      continue;
+    }
+    origin = kNoOrigin;
+    for (i64 flow = 0; flow < of.n_flows; ++flow) {
+      const Flow& ends = s.flow(cell, flow);
+      if (ends.target != task) continue;
+      const i64 from = ends.is_sampled ? value_of(s, s.job(key).site, flow) : cycle;
+      if (from != kNoValue) origin = std::min(origin, s.origin(cell, from, ends.source, chain));
+    }
+  }
+}
+
+// Records the completion of the last task of chains.
+template <class S>
+void actuate(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
+  const Cell& of = s.cell(cell);
+  for (i64 number = 0; number < of.n_chains; ++number) {
+    Chain& chain = s.chains[of.chain_0 + number];
+    if (chain.target != task) continue;
+    const i32 origin = s.origin(cell, cycle, task, number);
+    if (origin != kNoOrigin) chain.last = origin;
+    s.actuated_ns[s.actuation(cell, number, cycle)] = now;
+    s.actuated_from[s.actuation(cell, number, cycle)] = chain.last;
+  }
+}
+
+}  // namespace dwell

@@ -1,0 +1,118 @@
+"""Prices of ages and of misses: those of a static run on the same realisation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+import dwell
+from dwell.cost import excess
+from dwell.estimators.candidate_player import CandidatePlayer
+from dwell.estimators.prices import Question, price_of, prices_of
+from dwell.kernels.random_draws import draw
+from dwell.model import (
+    Caps,
+    Constant,
+    Execution,
+    MissCap,
+    Node,
+    NodeDisturbance,
+    Problem,
+    Task,
+    Uniform,
+    Weights,
+)
+from tests.cells.generated import make_problem
+
+SETTLING = 5
+WINDOWS = 25
+
+
+def with_ages(problem: Problem, latency: str | None = "see-act") -> Problem:
+    objective = replace(
+        problem.objective,
+        weights=Weights(age=1.0),
+        targets=replace(problem.objective.targets, age_ms=100.0),
+        latency=latency,
+    )
+    return replace(problem, objective=objective)
+
+
+@pytest.mark.parametrize("latency", ["see-act", None])
+def test_a_price_equals_a_static_run_on_the_same_realisation(latency: str | None) -> None:
+    problem = with_ages(dwell.load("examples/inner-loop.yaml"), latency)
+    drawn = draw(problem, scenario="weak-wifi", seed=3, windows=WINDOWS)
+    player = CandidatePlayer([(problem, drawn)])
+    for name in problem.candidates:
+        found = price_of(player, name)
+        windows = dwell.simulate_realisation(problem, drawn, policy=name).windows[SETTLING:]
+        assert found.l95_ms == pytest.approx(windows["seen_l95_ms"].mean(), rel=1e-12)
+        assert found.age is not None
+        assert found.age[0] == pytest.approx(windows["seen_age_ms"].mean(), rel=1e-12)
+        if latency is not None:
+            assert found.uncut_l95_ms >= found.l95_ms
+
+
+def test_what_an_objective_measures_is_part_of_a_prices_key() -> None:
+    problem = dwell.load("examples/inner-loop.yaml")
+    aged = with_ages(problem, None)
+    capped = replace(problem, objective=replace(problem.objective, caps=Caps(misses=MissCap(1, 9))))
+    known = [problem, aged, with_ages(problem), capped]
+    questions = {Question.of(one, "baseline", 1, None) for one in known}
+    assert len(questions) == len(known)
+
+
+def missing(share: float) -> Problem:
+    """Return a cell that misses a share of its deadlines, each independently."""
+    times = Uniform(0.0, 10.0)
+    problem = make_problem(
+        [Node("R", "robot", 1), Node("E", "edge", 1)],
+        [Task("act", {"R": Execution(times), "E": Execution(Constant(1.0))})],
+        candidates={"LOC": {"act": "R"}, "OFF": {"act": "E"}},
+        period_ms=20.0,
+        deadline_ms=10.0 * (1 - share),
+        window_cycles=50,
+    )
+    capped = replace(problem.objective, caps=Caps(misses=MissCap(m=2, k=20)))
+    return replace(problem, objective=capped)
+
+
+def test_a_cap_on_misses_plays_enough_cycles_and_counts_stretches() -> None:
+    problem = missing(0.05)
+    found = prices_of(problem)
+    # P(more than 2 of 20 independent cycles miss) for a share of 5 %.
+    binomial = 1 - sum(
+        coefficient * 0.05**m * 0.95 ** (20 - m) for m, coefficient in enumerate((1, 20, 190))
+    )
+    assert found["LOC"].misses == pytest.approx(binomial, rel=0.25)
+    assert found["OFF"].misses == 0.0
+    assert min(price.cycles for price in found.values()) >= 20 * 20
+    assert excess(found["LOC"].qos, problem.objective) == pytest.approx(
+        (found["LOC"].misses or 0.0) / 0.01 - 1
+    )
+    longer = replace(problem.objective, caps=Caps(misses=MissCap(m=20, k=200)))
+    prices = prices_of(replace(problem, objective=longer))
+    assert min(price.cycles for price in prices.values()) >= 20 * 200
+
+
+@pytest.mark.parametrize("estimator", ["profile", "corrected"])
+def test_a_candidate_over_the_cap_on_misses_is_not_eligible(estimator: str) -> None:
+    run = dwell.simulate(missing(0.05), seed=1, windows=4, policy=f"dtp+{estimator}")
+    first = run.decisions.row(0, named=True)
+    assert first["est_misses_LOC"] > 0.01 >= first["est_misses_OFF"] == 0.0
+    assert (first["eligible_LOC"], first["eligible_OFF"]) == (False, True)
+    assert run.decisions["placement"][-1] == "OFF"
+    fewer = dwell.simulate(missing(0.001), seed=1, windows=1, policy=f"dtp+{estimator}")
+    assert fewer.decisions["eligible_LOC"].all()
+
+
+def test_the_stretches_of_measured_conditions_are_long_enough() -> None:
+    problem = missing(0.05)
+    item = NodeDisturbance("R", stress_threads=1)
+    problem = replace(problem, scenarios={"busy": (item,)})
+    run = dwell.simulate(
+        problem, scenario="busy", seed=1, windows=8, policy="LOC", estimator="corrected"
+    )
+    last = run.decisions.row(-1, named=True)
+    assert 0.1 < last["est_misses_LOC"] <= 1.0

@@ -1,0 +1,289 @@
+"""Live cells in which a task does not wait for an input, but takes the newest message."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from random import Random
+from typing import Any
+
+import msgspec
+import pytest
+
+from dwell.live.stage import Message
+from dwell.live.trust.authority import Authority
+from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.signing import Seals
+from dwell.live.wire import channels
+from dwell.live.wire.messages import RatedCompletion, RatedHeader, decode, encode
+from dwell.live.wire.transport import Arrival
+from dwell.model import Problem
+from tests.live.memory_transport import NetworkConditions
+from tests.live.rated_cells import P_MS, SLOW, sampling, world_of
+from tests.live.small_world import MS, Passing, Staying, World, columns
+
+
+@dataclass
+class Log:
+    """Inputs of the controller's jobs on all nodes, in the order of the calls."""
+
+    inputs: list[Mapping[str, Message]] = field(default_factory=list)
+
+    def stage(self, name: str) -> Passing:
+        return _Controller(name, self)
+
+    @property
+    def samples(self) -> list[int | None]:
+        """Cycles of the values; None for a job without one."""
+        got = (inputs.get("detect") for inputs in self.inputs)
+        return [None if message is None else message.cycle for message in got]
+
+
+class _Controller(Passing):
+    def __init__(self, name: str, log: Log) -> None:
+        super().__init__(name)
+        self.log = log
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        self.log.inputs.append(inputs)
+        return Message(b"go")
+
+
+def logged(problem: Problem, **more: Any) -> tuple[World, Log]:
+    log = Log()
+    return world_of(problem, stages={"control": log.stage}, **more), log
+
+
+def require_never_older(samples: list[int | None]) -> None:
+    known = [cycle for cycle in samples if cycle is not None]
+    assert all(later >= earlier for earlier, later in pairwise(known))
+
+
+def test_a_job_gets_the_newest_value_as_a_message_of_its_own_cycle() -> None:
+    world, log = logged(sampling())
+    world.run(1_000)
+    steady = log.inputs[3 * SLOW :]
+    assert len(steady) > 70
+    for inputs in steady:
+        imu, value = inputs["imu"], inputs["detect"]
+        # The detection of a picture comes after the first job of its cycle has begun.
+        assert value.cycle == (imu.cycle - 1) // SLOW * SLOW
+        behind_ns = (imu.cycle - value.cycle) * P_MS * MS
+        assert imu.released_ns - value.released_ns == pytest.approx(behind_ns, abs=10)
+        assert value.age_ms - imu.age_ms == pytest.approx(behind_ns / MS, abs=1e-3)
+        assert value.origins == {"camera": value.cycle}
+        assert imu.origins == {"imu": imu.cycle}
+    # The controller does not wait for the detector.
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}
+
+
+def hear(world: World, channel: Any) -> list[Arrival]:
+    """Return a list that gets all messages of a channel, except copies on the detour."""
+    heard: list[Arrival] = []
+
+    def tap(sample: Arrival) -> None:
+        if world.keys.word(sample.key) == channel.word and world.keys.came_directly(sample.key):
+            heard.append(sample)
+
+    world.network.taps.append(tap)
+    return heard
+
+
+def test_hops_of_a_sampled_task_belong_to_their_own_cycle() -> None:
+    world, _ = logged(sampling(), policy=Staying(), jobs=True)
+    done = hear(world, channels.DONE)
+    world.run(1_000)
+    for sample in done:
+        completion = decode(sample.payload, RatedCompletion)
+        assert [hop.task for hop in completion.hops] == ["imu", "control", "act"]
+    rows = columns(world, "windows", "l95_ms", "violation_rate", "unproven")
+    assert len(rows) >= 3
+    assert all(l95_ms < 6 and not rate and not unproven for l95_ms, rate, unproven in rows)
+    numbers = [number for (number,) in columns(world, "cycles", "number")]
+    jobs = [row for row in world.recorder.rows["jobs"] if row[1] == "detect"]
+    assert len(jobs) > 8
+    assert {numbers[int(str(row[0]))] % SLOW for row in jobs} == {0}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_value_is_older_than_one_used_before(seed: int) -> None:
+    draw = Random(seed)
+    world, log = logged(sampling(), seed=seed)
+    noise = NetworkConditions(
+        duplication=0.2, reordering=0.3, reorder_ns=70 * MS, loss=0.05, delay_ns=MS
+    )
+    world.run(300)
+    for node in ("R", "E"):
+        world.network.impair(noise, f"detect@{node}")
+    forwards = hear(world, channels.VALUE)
+    for _ in range(12):
+        world.run(draw.uniform(30, 150))
+        world.order(draw.choice(["LOC", "AWAY", "SPLIT"]))
+    world.run(200)
+    require_never_older(log.samples)
+    assert len({*log.samples}) > 10
+    assert forwards
+
+
+def run_up_to_a_picture(world: World) -> None:
+    """Let time pass until just after a release of the camera."""
+    world.run(2 * P_MS)
+    while world.stamper.cycle % SLOW != 1:
+        world.run(1)
+
+
+def test_an_old_node_forwards_its_value_and_what_still_arrives() -> None:
+    world, log = logged(sampling())
+    world.run(500)
+    slow = NetworkConditions(delay_ns=25 * MS)
+    # The detection of the last picture before the move is still on its way to the old node.
+    world.network.impair(slow, "detect@R", "control@R")
+    run_up_to_a_picture(world)
+    forwards = hear(world, channels.VALUE)
+    assert world.order("AWAY") == ""
+    before = len(log.inputs)
+    world.run(40)
+    cycles = [decode(sample.header, RatedHeader).stamp.cycle for sample in forwards]
+    assert [cycle % SLOW for cycle in cycles] == [0, 0]
+    assert cycles[1] - cycles[0] == SLOW
+    keys = {sample.key for sample in forwards}
+    assert keys == {world.keys.of(channels.VALUE, "control", "E", "R")}
+    assert None not in log.samples[before + 1 :]
+    require_never_older(log.samples)
+
+
+def test_without_a_direct_link_there_is_no_value_until_the_next_message() -> None:
+    away = {"on": "E", "initial": "AWAY"}
+    world, log = logged(sampling(linked_back=False, controller=away))
+    world.run(500)
+    run_up_to_a_picture(world)
+    world.run(P_MS)
+    forwards, before = hear(world, channels.VALUE), len(log.inputs)
+    assert world.order("LOC") == ""
+    world.run(200)
+    assert forwards == []
+    without = [place for place, cycle in enumerate(log.samples) if cycle is None and place > before]
+    assert 2 <= len(without) < SLOW
+    assert without == list(range(without[0], without[-1] + 1))
+    require_never_older(log.samples)
+
+
+def test_a_task_with_sampled_inputs_alone_is_released_like_a_source() -> None:
+    world, log = logged(sampling(waited=False))
+    world.run(500)
+    world.order("AWAY")
+    world.run(500)
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}
+    assert None not in log.samples[2 * SLOW : 45]
+    assert log.samples[-1] is not None
+
+
+def guarded(**changes: Any) -> Problem:
+    controller = {"on": "E", "initial": "LOC", "fallbacks": ["LOC"], "probe_cycles": 10}
+    return sampling(controller=controller, **changes)
+
+
+@pytest.mark.parametrize("arrives", [True, False])
+def test_a_probe_is_complete_when_its_sampled_output_has_arrived(arrives: bool) -> None:
+    world, _ = logged(guarded(), policy="SPLIT")
+    world.run(300)
+    world.move_by_guard("LOC")
+    if not arrives:
+        world.network.cut("detect@E.shadow", "control@R")
+    # Only every fifth cycle has a probe that counts.
+    world.run(10 * SLOW * P_MS)
+    assert world.stamper.placement == "LOC"
+    world.run(1_000)
+    assert world.stamper.placement == ("SPLIT" if arrives else "LOC")
+
+
+CHAINS = {"see-act": {"from": "camera", "to": "act", "max_age_ms": 50}}
+
+
+def test_recorded_ages_are_those_of_the_jobs(tmp_path: Path) -> None:
+    world, log = logged(sampling(chains=CHAINS), policy=Staying())
+    done = hear(world, channels.DONE)
+    world.run(400)
+    world.order("AWAY")
+    world.run(600)
+    sampled = {inputs["imu"].cycle: inputs.get("detect") for inputs in log.inputs}
+    age_ms: dict[int, float] = {}
+    first = origin = 0
+    for completion in (decode(sample.payload, RatedCompletion) for sample in done):
+        stamp = completion.stamp
+        first = first or stamp.released_ns - stamp.cycle * P_MS * MS
+        value = sampled[stamp.cycle]
+        origin = origin if value is None else value.cycle
+        age_ms[stamp.cycle] = (completion.done_ns - first) / MS - origin * P_MS
+    numbers = [number for (number,) in columns(world, "cycles", "number")]
+    windows = columns(world, "windows", "first_cycle", "age_l95_see-act", "age_missed_see-act")
+    assert len(windows) >= 3
+    for row, l95_ms, missed in windows:
+        ages = [age_ms[number] for number in numbers[row : row + 20]]
+        assert l95_ms == pytest.approx(sorted(ages)[18])
+        assert missed == sum(age > 50 for age in ages) / 20
+    assert any(missed for _, _, missed in windows)
+
+
+def test_the_guard_leaves_a_placement_whose_detector_is_dead() -> None:
+    controller = {"on": "E", "initial": "SPLIT", "fallbacks": ["LOC"]}
+    world, log = logged(sampling(chains=CHAINS, controller=controller))
+    world.run(600)
+    assert world.stamper.moves == []
+    world.kill("detect@E")
+    world.run(600)
+    assert world.stamper.placement == "LOC"
+    # Commands continue while the detector is dead, and have new pictures behind them later.
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}
+    newest = log.samples[-1]
+    assert newest is not None
+    assert newest >= world.stamper.cycle - 2 * SLOW
+
+
+@pytest.fixture
+def seals(tmp_path: Path) -> dict[str, Seals]:
+    authority = Authority.create(tmp_path, "cell")
+    for node in ("R", "E"):
+        authority.issue(node, "node")
+    authority.issue("controller", "controller")
+    names = "R", "E", "controller"
+    return {name: Seals(Keyring.open(tmp_path / name, cell="cell")) for name in names}
+
+
+def test_a_forwarded_value_needs_the_signature_of_its_stamp(seals: dict[str, Seals]) -> None:
+    world, log = logged(sampling(), seals=seals, policy=Staying())
+    world.run(500)
+    forwards = hear(world, channels.VALUE)
+    world.move_by_guard("AWAY")
+    world.run(300)
+    assert forwards
+    require_never_older(log.samples)
+    worker = world.worker("control@E")
+    header = decode(forwards[-1].header, RatedHeader)
+    newest = max(cycle for cycle in log.samples if cycle is not None)
+    for cycle, is_signed in ((header.stamp.cycle, True), (newest + 1_000, False)):
+        stamp = msgspec.structs.replace(header.stamp, cycle=cycle)
+        forged = encode(msgspec.structs.replace(header, stamp=stamp))
+        before = worker.place.complained
+        worker.receive(Arrival(forwards[-1].key, b"-", forged), world.network.now_ns)
+        assert worker.place.complained == before + (not is_signed)
+    world.run(50)
+    assert log.samples[-1] is not None
+    assert log.samples[-1] < newest + 1_000
+
+
+def senders(problem: Problem, word: str) -> Iterator[tuple[tuple[str, ...], list[str]]]:
+    for chunks, names in channels.CHANNELS[word].senders(problem):
+        yield tuple(chunks), sorted(names)
+
+
+def test_only_old_nodes_of_a_sampling_task_may_forward_values() -> None:
+    problem = sampling()
+    assert dict(senders(problem, "value")) == {
+        ("control", "E", "R"): ["R"],
+        ("control", "R", "E"): ["E"],
+    }
+    may_send = dict(senders(sampling(waited=False), "in"))
+    assert may_send["control", "E", "main"] == ["E", "R"]
