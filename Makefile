@@ -19,7 +19,7 @@ COMPILE := $(UV) pip compile --quiet --python $(BIN)/python --universal --python
 	--generate-hashes --custom-compile-command "make lock" $(if $(UPGRADE),--upgrade)
 
 .DEFAULT_GOAL := help
-.PHONY: help env demo docs test test-sim test-live test-lab test-all check types tidy bench paper planted faults seeds chaos soak fuzz audit release-check sbom lock clean again
+.PHONY: help env demo docs test test-sim test-live test-lab test-all tests check lint types tidy collected bench paper planted faults seeds chaos soak fuzz audit release-check sbom lock clean again
 
 help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "make %-13s %s\n", $$1, $$2}' Makefile
@@ -89,21 +89,32 @@ test-all: env ## Run the tests that `make test` leaves out (conftest.py)
 	$(TESTS) $(BESIDE) -m "exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
 	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
 
-# What takes longest runs side by side. clang-tidy reads the headers of the system's own C++ library.
+tests: env ## Run `make test` and `make test-all` in one, as .ci/run does
+	$(TESTS) $(BESIDE) -m "not alone" $(ARGS) || [ $$? -eq 5 ]
+	$(TESTS) -m alone $(ARGS) || [ $$? -eq 5 ]
+
+# Side by side. clang-tidy reads the headers of the system's own C++ library.
 check: env ## Lint, formatting, types, the borders between packages and lines of code
+	@$(MAKE) --no-print-directory --jobs --output-sync tidy types collected lint
+
+lint:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports --no-logo
 	$(BIN)/python -m tests.plain_english
 	$(BIN)/python -m tests.code_lines
 	$(BIN)/clang-format --dry-run -Werror $(filter %.cpp %.h,$(SOURCES)) tests/kernels/*.cpp
-	@$(MAKE) --no-print-directory --jobs --output-sync types tidy
 
 types:
 	$(BIN)/mypy $(CODE) hatch_build.py
 
 tidy:
 	$(BIN)/clang-tidy --quiet $(filter %.cpp,$(SOURCES))
+
+# pytest compiles each file of tests here, and not once per process of `make test`.
+collected:
+	@mkdir -p build
+	@$(TESTS) --collect-only -qq >build/collected.txt || (cat build/collected.txt; exit 1)
 
 docs: $(VENV)/tools/site ## Make the site from the pages into build/site (strict)
 	PYTHONPATH=$< $(BIN)/python -m docs.site

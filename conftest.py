@@ -58,7 +58,6 @@ TOGETHER = {
         "tests/live/commands/test_live_secure.py",
         "tests/cli/test_new.py",
         "tests/dash/test_live_page.py",
-        "tests/dash/test_live_page_with_keys.py",
     ),
     "testbeds": (
         "lab/tests/commands/test_testbed.py",
@@ -86,7 +85,7 @@ EXHAUSTIVE: Chosen = {
         *(f"test_cell_survives[cut {a}->{b}]" for a, b in permutations(("R1", "E", "R2"), 2)),
     ),
     "tests/live/test_seeded_faults.py": tuple(
-        f"test_no_fault_breaks_a_promise[{block}]" for block in range(2, 7)
+        f"test_no_fault_breaks_a_promise[{block}]" for block in range(2, 4)
     ),
     "tests/reference/test_against.py": ("the others",),
     "tests/reference/test_guarded.py": ("the others",),

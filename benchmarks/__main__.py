@@ -26,6 +26,7 @@ BENCHMARKS = {
     "sooner": ("sooner", "measure"),
     "passing": ("passing_faults", "measure"),
     "errors": ("stated_errors", "measure"),
+    "rates": ("rated_prices", "measure"),
     "placements": ("placements", "measure"),
     "schedulers": ("placements", "schedulers"),
     "all": ("all_candidates", "measure"),

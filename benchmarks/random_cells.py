@@ -17,6 +17,29 @@ def random_cell(number: int) -> Problem:
     return from_document(_document(number))
 
 
+def rated_cell(number: int) -> Problem:
+    """Return the cell with several rates: sources skip cycles, and some flows are sampled."""
+    document = _document(number)
+    rng, rates = random.Random(60_000 + number), dict[str, int]()
+    for name, task in document["tasks"].items():
+        waited = [flow for flow in document["flows"] if flow["to"] == name]
+        kept: list[int] = []
+        for flow in waited:
+            rate = rates[flow["from"]]
+            if rng.random() < SAMPLED or any(rate % one and one % rate for one in kept):
+                flow["sampled"] = True
+            else:
+                kept.append(rate)
+        rates[name] = max(kept, default=0) or rng.choice(RATES)
+        if not kept or min(kept) < max(kept):
+            task["every"] = rates[name]
+    return from_document(document)
+
+
+#: Cycles from one run of a source to its next; share of the flows that are sampled.
+RATES, SAMPLED = (1, 1, 2, 5, 10), 0.3
+
+
 def passing_faults(number: int) -> Problem:
     """Return the cell with the default settings; each fault holds once, for 30 of 120 s."""
     document = _document(number)

@@ -61,7 +61,7 @@ def compared(problem: Problem) -> Iterator[Compared]:
             windows=max(SEEN) + 1,
         ).decisions
         for name in problem.candidates:
-            true = _true(problem, scenario, name)
+            true = true_means(problem, scenario, name)
             for window in SEEN:
                 row = decisions.row(window, named=True)
                 l95 = row[f"est_l95_ms_{name}"], row[f"est_l95_error_ms_{name}"]
@@ -74,7 +74,9 @@ def _agree(one: tuple[float, float], other: tuple[float, float]) -> bool:
     return abs(one[0] - other[0]) <= BAND * math.hypot(one[1], other[1]) + 1e-9
 
 
-def _true(problem: Problem, scenario: str, name: str) -> list[tuple[float, float]]:
+def true_means(
+    problem: Problem, scenario: str, name: str, windows: int = WINDOWS
+) -> list[tuple[float, float]]:
     """Return L95 (ms) and V_D of a placement that stays, with their standard errors."""
     runs = [
         dwell.simulate(
@@ -83,7 +85,7 @@ def _true(problem: Problem, scenario: str, name: str) -> list[tuple[float, float
             policy=name,
             estimator=SendsOnly(problem),
             seed=seed,
-            windows=WARMUP + WINDOWS,
+            windows=WARMUP + windows,
         ).windows[WARMUP:]
         for seed in SEEDS
     ]

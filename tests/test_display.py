@@ -145,7 +145,6 @@ def objects(
     known = QoS(20.0, 0.0, dict.fromkeys(canonical.fabric.nodes, 0.5))
     proposal = controller.propose_by(known, dict.fromkeys(canonical.fabric.nodes, 0.5))
     table = TraceTable("drive.csv", {"rtt_ms": np.arange(5_000.0)})
-    guard = {"patience_ns": 3, "probe_cycles": 30}
     policies = ("dtp", "latency-first", "work-function", "atp", "atp-thresholds", "cusum", "LOC")
     files = ("fan-in.yaml", "cloud.yaml", "live/cell.yaml", "visual_servoing/testbed.yaml")
     trees: list[object] = [
@@ -157,7 +156,8 @@ def objects(
         *(controller, controller.estimator, controller.course, proposal),
         Presence.of(canonical),
         *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, [0.05] * 3)),
-        *(Guard(["LOC"], placement="SO", **guard), CellGuard(canonical)),
+        Guard(["LOC"], patience_ns=3, probe_cycles=30, placement="SO"),
+        CellGuard(canonical),
         Probation(30, health_cycles=10, patience_ns=1),
         ClosedWindow(ints[:, 0], ints[:, 0], 1, 0, np.zeros((3, 3)), LookedAt(0, 0, 1)),
         *(instants, Evidence.of(1, ints[:, 0], ints[:, 0], instants, ints[:, 0], instants)),

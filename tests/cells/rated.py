@@ -18,8 +18,18 @@ RATES = 1, 1, 2, 3, 4, 6
 SAMPLED = 0.35
 
 
-def with_rates(problem: Problem, rng: Random) -> Problem:
-    """Let sources run in every n-th cycle, and sample some flows; windows have all sinks."""
+def with_rates(problem: Problem, rng: Random, *, idle: bool = True) -> Problem:
+    """Let sources run in every n-th cycle, and sample some flows; windows have all sinks.
+
+    Without `idle` a sink runs in every cycle.
+    """
+    made = _with_rates(problem, rng)
+    while made.pipeline.has_idle_cycles and not idle:
+        made = _with_rates(problem, rng)
+    return made
+
+
+def _with_rates(problem: Problem, rng: Random) -> Problem:
     pipeline = problem.pipeline
     flows = [replace(flow, sampled=rng.random() < SAMPLED) for flow in pipeline.flows]
     rates: dict[str, int] = {}

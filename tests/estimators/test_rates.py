@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from dwell.estimators import warnings_of
 from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.measured import Site
 from dwell.estimators.present import Present
-from dwell.estimators.prices import prices_of
+from dwell.estimators.prices import RATE, prices_of
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.random_draws import draw
 from dwell.model import Problem
@@ -34,6 +35,14 @@ def test_a_price_is_the_mean_of_runs_that_stay(problem: Problem) -> None:
         violation_rate = np.mean([float(row["violation_rate"]) for row in runs])
         assert price.l95_ms == pytest.approx(l95_ms, rel=0.02)
         assert price.violation_rate == pytest.approx(violation_rate, abs=0.01)
+
+
+def test_a_price_with_idle_cycles_is_as_precise_as_others() -> None:
+    problem = idle_cell()
+    problem = replace(problem, pipeline=replace(problem.pipeline, deadline_ms=9.5))
+    price = prices_of(problem)["SO"]
+    assert 0.2 < price.violation_rate < 0.8
+    assert price.violation_error <= RATE
 
 
 def test_own_work_counts_each_run() -> None:

@@ -32,7 +32,9 @@ from dwell.model import (
 )
 from dwell.sim import Realisation, draw, simulate_realisation
 from tests.cells.generated import make_problem
+from tests.cells.rated import with_rates
 from tests.estimators.windows import Row, window
+from tests.reference.rates import Rates
 
 MS = 1_000_000
 PERIOD_MS = 20.0
@@ -92,7 +94,7 @@ class Replay:
         return next(self.next)
 
 
-def make_case(seed: int) -> Case:
+def make_case(seed: int, *, rates: bool = False) -> Case:
     """Make a cell in which things wait for each other, and a realisation with exact ratios."""
     rng = Random(seed)
     nodes = [
@@ -150,6 +152,10 @@ def make_case(seed: int) -> Case:
         deadline_ms=rng.choice([5.0, 12.0, 20.0]),
         window_cycles=rng.choice([1, 5, 20, 30]),
     )
+    if rates:
+        problem = with_rates(problem, rng)
+        controller = replace(problem.controller, decide_cycles=problem.window_cycles)
+        problem = replace(problem, controller=controller)
     windows = rng.randint(2, 5)
     drawn = draw(problem, scenario="disturbed", seed=seed, windows=windows)
     factors = {site: rng.choice([1, 2, 3, 6]) for site in drawn.sites}
@@ -213,13 +219,16 @@ def delays_ns(real: Realisation, hop: int) -> Ints:
 
 
 def queue_free_ns(case: Case, placement: Placement) -> list[float]:
-    """Latency of each cycle if nothing ever waited for anything: recursion, cycle by cycle."""
+    """Latency of each cycle if nothing ever waited for anything: recursion, cycle by cycle.
+
+    It is NaN for idle cycles.
+    """
     problem, real = case.problem, case.real
     pipeline, sites = problem.pipeline, {site: i for i, site in enumerate(real.sites)}
     hops = {hop: delays_ns(real, i) for i, hop in enumerate(real.hops)}
 
     def ready(task: str, cycle: int) -> float:
-        inputs = [flow for flow in pipeline.flows if flow.target == task]
+        inputs = [flow for flow in pipeline.flows if flow.target == task and not flow.sampled]
         if not inputs:
             return pipeline.tasks[task].offset_ms * MS
         return max(done(flow.source, cycle) + sent(flow, cycle) for flow in inputs)
@@ -238,7 +247,11 @@ def queue_free_ns(case: Case, placement: Placement) -> list[float]:
         return transmission + int(hops[flow.source, flow.target, link.name][cycle])
 
     sinks = [t for t in pipeline.tasks if not any(flow.source == t for flow in pipeline.flows)]
-    return [max(done(sink, cycle) for sink in sinks) for cycle in range(real.cycles)]
+    rates = Rates(pipeline)
+    return [
+        max((done(sink, cycle) for sink in sinks if rates.is_due(sink, cycle)), default=math.nan)
+        for cycle in range(real.cycles)
+    ]
 
 
 def play(case: Case, ratios: Mapping[tuple[str, str, str], float]) -> Witness:
@@ -260,8 +273,10 @@ def underestimates(case: Case, witness: Witness) -> list[tuple[int, str, float, 
         shown = zip(witness.first_ns, witness.completed, witness.said, strict=True)
         for k, (first_ns, completed, said) in enumerate(shown):
             first = int(np.searchsorted(case.real.release_ns, first_ns))
-            cycles = np.sort(np.where(completed, latency[first : first + W], 0.0))
-            l95_ms = min(cycles[math.ceil(W * 95 / 100) - 1] / MS, problem.censor_ms)
+            window = np.array(latency[first : first + W])
+            due = ~np.isnan(window)
+            cycles = np.sort(np.where(completed, window, 0.0)[due])
+            l95_ms = min(cycles[math.ceil(len(cycles) * 95 / 100) - 1] / MS, problem.censor_ms)
             missed = float((cycles > problem.pipeline.deadline_ms * MS).mean())
             # Bounds are in milliseconds, to whole nanoseconds.
             if said[name].l95_ms < l95_ms - 1e-9:
@@ -285,14 +300,23 @@ def test_with_true_ratios_it_never_underestimates(seed: int) -> None:
     assert underestimates(case, witness) == []
 
 
-def test_bounds_are_no_trivial_ones() -> None:
+@pytest.mark.parametrize("seed", range(12))
+def test_with_several_rates_it_never_underestimates_either(seed: int) -> None:
+    case = make_case(seed, rates=True)
+    witness = play(case, case.ratios)
+    assert len(witness.said) > 0
+    assert underestimates(case, witness) == []
+
+
+@pytest.mark.parametrize("rates", [False, True])
+def test_bounds_are_no_trivial_ones(rates: bool) -> None:
     """In half of the windows and more a bound is finite and within twice the truth."""
     close = total = 0
     for seed in range(20):
-        case = make_case(seed)
+        case = make_case(seed, rates=rates)
         witness = play(case, case.ratios)
         for name, placement in case.problem.candidates.items():
-            longest = max(queue_free_ns(case, placement)) / MS
+            longest = float(np.nanmax(queue_free_ns(case, placement))) / MS
             for said in witness.said:
                 total += 1
                 close += said[name].l95_ms <= 2 * longest

@@ -75,6 +75,31 @@ def fork(
 # ------------------------------------------------------------------------------- who is hindered
 
 
+def sampling(problem: Problem, source: str, target: str) -> Problem:
+    """Return the cell with one of its flows sampled."""
+    pipeline = problem.pipeline
+    flows = tuple(
+        replace(flow, sampled=True) if (flow.source, flow.target) == (source, target) else flow
+        for flow in pipeline.flows
+    )
+    return replace(problem, pipeline=replace(pipeline, flows=flows))
+
+
+def test_a_shadow_gets_no_sampled_message_of_a_shared_job() -> None:
+    ordered = fork(in_order=True)
+    assert hindered(ordered) == {"LOC"}
+    assert hindered(sampling(ordered, "A", "B")) == set()
+
+
+def test_a_shadow_job_sends_its_sampled_outputs() -> None:
+    """Under OFF the shadow of B sends to D, which is not apart, over a link of own messages."""
+    problem = fork()
+    back = replace(problem.fabric.links["E->R"], in_order=True)
+    fabric = replace(problem.fabric, links={**problem.fabric.links, "E->R": back})
+    ordered = sampling(replace(problem, fabric=fabric), "B", "D")
+    assert hindered(ordered) == {"LOC"}
+
+
 def test_nobody_is_hindered_by_what_own_jobs_leave_of_cores_and_links_without_a_rate() -> None:
     assert hindered(fork(kilobytes=1000)) == set()
 

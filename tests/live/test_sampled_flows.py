@@ -180,6 +180,39 @@ def test_a_task_with_sampled_inputs_alone_is_released_like_a_source() -> None:
     assert log.samples[-1] is not None
 
 
+#: Messages that arrive after those of the next run.
+OVERTAKEN = NetworkConditions(reordering=1.0, reorder_ns=80 * MS)
+
+
+def test_a_join_that_no_sink_waits_for_keeps_overlapping_cycles() -> None:
+    on = {"R": {"exec_ms": 1}}
+    tasks: dict[str, Any] = {name: {"on": on} for name in ("imu", "detect", "control")}
+    tasks |= {name: {"every": SLOW, **tasks["imu"]} for name in ("camera", "lidar")}
+    flows = [
+        {"from": "camera", "to": "detect"},
+        {"from": "lidar", "to": "detect"},
+        {"from": "imu", "to": "control"},
+        {"from": "detect", "to": "control", "sampled": True},
+    ]
+    problem = sampling(tasks=tasks, flows=flows, candidates={"LOC": {}}, controller={"on": "E"})
+    ran: list[int] = []
+
+    class Detecting(Passing):
+        def process(self, inputs: Mapping[str, Message]) -> Message:
+            ran.append(inputs["lidar"].cycle)
+            return super().process(inputs)
+
+    world = world_of(problem, stages={"detect": Detecting})
+    world.run(300)
+    run_up_to_a_picture(world)
+    late = world.network.impair(OVERTAKEN, "lidar@R", "detect@R")
+    world.run(P_MS)
+    world.network.heal(late)
+    world.run(300)
+    assert ran != sorted(ran)
+    assert sorted(ran) == list(range(min(ran), max(ran) + 1, SLOW))
+
+
 def guarded(**changes: Any) -> Problem:
     controller = {"on": "E", "initial": "LOC", "fallbacks": ["LOC"], "probe_cycles": 10}
     return sampling(controller=controller, **changes)

@@ -301,7 +301,7 @@ def test_what_follows_from_a_deadline(
 ) -> None:
     problem = _problem()
     problem = replace(problem, pipeline=replace(problem.pipeline, deadline_ms=deadline_ms))
-    assert problem.max_age_ms == max_age_ms
+    assert problem.max_age_ms(next(iter(problem.pipeline.tasks))) == max_age_ms
     assert problem.pipeline.open_cycles == open_cycles
     # g is 3.
     assert problem.guard_patience_ns == patience_ms * 1e6

@@ -75,6 +75,11 @@ def rate(value: float) -> pl.Expr:
 
 
 KINDS = (*("one window", "no decision", "all met", "all missed", "all lost", "long names"),)
+SCREENS = ((1280, "light"), (400, "dark"))
+#: Each page is drawn on one of both screens, and the other page of the run on the other; with long
+#: names, on both.
+REPORTS = [*((kind, *SCREENS[i % 2]) for i, kind in enumerate(KINDS)), (KINDS[-1], *SCREENS[0])]
+RUNS = [*((kind, *SCREENS[1 - i % 2]) for i, kind in enumerate(KINDS)), (KINDS[-1], *SCREENS[1])]
 
 
 @pytest.fixture(scope="module")
@@ -84,40 +89,36 @@ def browser() -> Iterator[Browser]:
 
 
 @in_browser
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "width", "scheme"), REPORTS)
 def test_the_report_fits_and_the_browser_is_silent(
-    kind: str, tmp_path: Path, browser: Browser
+    kind: str, width: int, scheme: str, tmp_path: Path, browser: Browser
 ) -> None:
     file = tmp_path / "report.html"
     file.write_text(run_html(made(kind, tmp_path)), encoding="utf-8")
     drawn = "document.querySelectorAll('section:not(:has(details)) .drawing.live').length > 1"
-    for width, scheme in ((1280, "light"), (400, "dark")):
-        size = {"width": width, "height": 900}
-        with opened(
-            browser, file.as_uri(), ready=drawn, viewport=size, color_scheme=scheme
-        ) as page:
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
+    size = {"width": width, "height": 900}
+    with opened(browser, file.as_uri(), ready=drawn, viewport=size, color_scheme=scheme) as page:
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 @in_browser
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "width", "scheme"), RUNS)
 def test_the_page_of_the_run_fits_and_the_browser_is_silent(
-    kind: str, tmp_path: Path, browser: Browser
+    kind: str, width: int, scheme: str, tmp_path: Path, browser: Browser
 ) -> None:
     made(kind, tmp_path).save(tmp_path / "run")
     with serving(tmp_path, tmp_path / "run") as served:
-        for width, scheme in ((1280, "light"), (400, "dark")):
-            size = {"width": width, "height": 900}
-            with opened(
-                browser, served.address, ready=READY, viewport=size, color_scheme=scheme
-            ) as page:
-                settled(page)
-                assert page.evaluate("document.documentElement.scrollWidth") <= width
-                verdict = page.locator(".verdict .judged").inner_text()
-                if kind in ("all missed", "all lost"):
-                    assert "100.00 %" in verdict
-                if kind == "all met":
-                    assert "0.00 %" in verdict
+        size = {"width": width, "height": 900}
+        with opened(
+            browser, served.address, ready=READY, viewport=size, color_scheme=scheme
+        ) as page:
+            settled(page)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width
+            verdict = page.locator(".verdict .judged").inner_text()
+            if kind in ("all missed", "all lost"):
+                assert "100.00 %" in verdict
+            if kind == "all met":
+                assert "0.00 %" in verdict
 
 
 def test_a_lost_l95_has_no_value_and_a_mark_of_its_own(tmp_path: Path) -> None:

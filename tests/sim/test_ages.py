@@ -206,6 +206,6 @@ def test_weights_and_caps_check_their_numbers() -> None:
     objective = cell().objective
     with pytest.raises(ProblemError, match=r"targets\.age_ms"):
         replace(objective, weights=Weights(age=1.0))
-    with pytest.raises(ProblemError, match=r"caps\.misses\.m"):
+    with pytest.raises(ProblemError, match=r"misses\.m"):
         MissCap(20, 20)
     assert MissCap(2, 20).least_cycles == 400

@@ -21,6 +21,8 @@ Rows: TypeAlias = slice | NDArray[np.bool_] | NDArray[np.int64]
 
 #: Value of an instant that was still in the future, or unknown, at the end of the window.
 UNKNOWN = -1
+#: Value of the instants of jobs and messages that are not due in a cycle.
+NOT_DUE = -2
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.model.number_arrays import Floats
 from dwell.model.pipeline import Flow, Pipeline
@@ -51,13 +52,17 @@ def steps_of(pipeline: Pipeline) -> tuple[Step, ...]:
 
 
 def longest_path(
-    steps: Sequence[Step], executed: Sequence[Floats], sent: Sequence[Floats | float]
+    steps: Sequence[Step],
+    executed: Sequence[Floats],
+    sent: Sequence[Floats | float],
+    is_due: NDArray[np.bool_] | None = None,
 ) -> Floats:
     """Return the latency of each cycle, shape (n,), in the unit of its parts.
 
     The equation is eq. 3 of the paper, for any DAG. `executed` has the times of each task's jobs
     and `sent` the times of each flow's messages, in the pipeline's order and with shape (n,). The
-    time of a message within a node is 0.0.
+    time of a message within a node is 0.0. `is_due` tells whether each task is due in each cycle,
+    shape (n, tasks); only sinks that are due count [default: all].
     """
     finish: dict[int, Floats] = {}
     for step in steps:
@@ -72,6 +77,9 @@ def longest_path(
         if step.inputs or step.offset_ms:
             executes = ready + executes
         finish[step.column] = executes
-    sinks = [finish[step.column] for step in steps if step.sink]
+    columns = [step.column for step in steps if step.sink]
+    sinks = [finish[column] for column in columns]
+    if is_due is not None:
+        sinks = [np.where(is_due[:, column], finish[column], 0.0) for column in columns]
     latency: Floats = np.maximum.reduce(sinks) if len(sinks) > 1 else sinks[0]
     return latency

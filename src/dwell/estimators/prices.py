@@ -264,11 +264,15 @@ def most_windows(problem: Problem, cycles: int | None = None) -> int:
     """Return the largest number of windows of a candidate, at least 1.
 
     If `cycles` is given, at least that many cycles count, up to the longest possible run; otherwise
-    `MOST_CYCLES` and `MOST_EVENTS` (releases, completions and messages) are the limits.
+    `MOST_CYCLES`, without idle cycles, and `MOST_EVENTS` (releases, completions and messages) are
+    the limits.
     """
     pipeline, width = problem.pipeline, problem.window_cycles
     events = 1 + len(pipeline.tasks) + len(pipeline.flows)
-    most = min(MOST_CYCLES, MOST_EVENTS // events) // width
+    if pipeline.has_rates:
+        rates = *pipeline.rates.values(), *map(pipeline.message_rate, pipeline.flows)
+        events = math.ceil(1 + sum(1 / every for every in rates))
+    most = min(MOST_CYCLES * pipeline.due_interval, MOST_EVENTS // events) // width
     if cycles is not None:
         most = SETTLING + -(-cycles // width)
     return max(min(most, longest_run(pipeline.period_ms) // width), 1)

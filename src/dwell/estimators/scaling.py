@@ -20,7 +20,8 @@ Bounds
       link with its declared behaviour meets this condition.
 
     The work of a job that waited or was replaced is unknown; it counts as the longest known work.
-    L95 is cut at ``problem.censor_ms``.
+    L95 is cut at ``problem.censor_ms``. With several rates a cycle has the sinks that are due in
+    it, and tasks behind sampled flows are on no path.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from typing import ClassVar
 import numpy as np
 
 from dwell.errors import Fault, ProblemError
-from dwell.estimators.evidence import Evidence
+from dwell.estimators.evidence import NOT_DUE, Evidence
 from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part, Site, cores_of, message_of, sending_ns
 from dwell.estimators.paths import longest_path, steps_of
@@ -89,11 +90,16 @@ class Scaling(Learning):
         names = list(problem.pipeline.tasks)
         self._sources = [names.index(flow.source) for flow in problem.pipeline.flows]
         self._message_patience_ns = flow_patience_ns(problem)
+        rates = problem.pipeline.sink_rates
+        #: Tasks on waited ways to a sink; the latency of a cycle does not depend on the others.
+        self._on_path = {name for name in names if rates[name]}
         #: Longest known time of each task, alone on its node, milliseconds.
         self._longest: dict[Site, float] = {}
         self._active: Placement | None = None
         #: Times of jobs (each alone) and of messages in the last window, milliseconds, by cycle.
         self._jobs, self._messages = np.empty((0, 0)), np.empty((0, 0))
+        #: Whether each task is due in each cycle of the last window.
+        self._is_due = np.empty((0, 0), np.bool_)
 
     def _take_in(self, evidence: Evidence) -> None:
         super()._take_in(evidence)
@@ -119,7 +125,7 @@ class Scaling(Learning):
         for column, task in enumerate(self.problem.pipeline.tasks):
             alone_ms[:, column] = self._filled(Site(task, active[task]), alone_ms[:, column])
         limit_ns = evidence.close_ns - self._message_patience_ns
-        self._jobs = alone_ms
+        self._jobs, self._is_due = alone_ms, cycles.end_ns != NOT_DUE
         sent_ns = cycles.end_ns[:, self._sources]
         self._messages = spans_ms(sent_ns, cycles.arrived_ns, limit_ns)
 
@@ -162,8 +168,8 @@ class Scaling(Learning):
     ) -> dict[str, QoS]:
         """Estimate every candidate's metrics (see `Estimator`)."""
         estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
-        # With several rates the parts of one cycle show no bound on its latency.
-        has_path = not self.problem.pipeline.has_rates and self.problem.objective.latency is None
+        # The latency of a cycle bounds no data age.
+        has_path = self.problem.objective.latency is None
         if self._active is not None and len(self._jobs) and has_path:
             for name, placement in self.problem.candidates.items():
                 estimates[name] = self._at_least(estimates[name], placement, self._active)
@@ -171,7 +177,7 @@ class Scaling(Learning):
 
     def _at_least(self, qos: QoS, placement: Placement, active: Placement) -> QoS:
         """Raise metrics to at least the metrics of the window's cycles without queues."""
-        pipeline = self.problem.pipeline
+        pipeline, columns = self.problem.pipeline, list(self.problem.pipeline.tasks)
         executed = [
             self._executed(column, task, active, placement)
             for column, task in enumerate(pipeline.tasks)
@@ -182,6 +188,8 @@ class Scaling(Learning):
                 message_of(flow.source, flow.target, active),
                 self._messages[:, column],
             )
+            if flow.target in self._on_path and not flow.sampled
+            else 0.0
             for column, flow in enumerate(pipeline.flows)
         ]
         known = [times for times in executed if times is not None]
@@ -189,7 +197,11 @@ class Scaling(Learning):
         if len(known) < len(executed) or len(on_the_way) < len(sent):
             return qos
         # Rounded to nanoseconds, like all times.
-        latency_ms = np.round(longest_path(self._steps, known, on_the_way), 6)
+        latency_ms = np.round(longest_path(self._steps, known, on_the_way, self._is_due), 6)
+        sinks = [columns.index(name) for name in pipeline.sinks]
+        latency_ms = latency_ms[self._is_due[:, sinks].any(axis=1)]
+        if not len(latency_ms):
+            return qos
         missed = int(np.count_nonzero(latency_ms > pipeline.deadline_ms)) / len(latency_ms)
         bound_ms = percentile(latency_ms, 95)
         return replace(
@@ -204,7 +216,7 @@ class Scaling(Learning):
     ) -> Floats | None:
         """Return a bound on the time of a task's job in each cycle; None if unknown."""
         here, there, alone_ms = active[task], placement[task], self._jobs[:, column]
-        if here == there:
+        if here == there or task not in self._on_path:
             return alone_ms
         ratio = self._ratios.get((task, here, there))
         return None if ratio is None else alone_ms * ratio

@@ -71,7 +71,9 @@ def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
     own_links = {part.link for part in parts_of(pipeline, here) if isinstance(part, Message)}
     held_ns = 0.0
     for flow in pipeline.flows:
-        message = message_of(flow.source, flow.target, there) if flow.target in apart else None
+        # A shadow job sends its sampled outputs; a shared job sends none to the shadow.
+        is_sent = (flow.source if flow.sampled else flow.target) in apart
+        message = message_of(flow.source, flow.target, there) if is_sent else None
         if message is not None and message.link in own_links:
             if links[message.link].in_order:
                 return True

@@ -19,8 +19,8 @@ def patience_ns(problem: Problem, every: int = 1) -> int:
     longer than P, because the window then ends later by as much.
 
     A task that runs in each `every`-th cycle, and its messages, have `PATIENCE` times this
-    interval, but less than the age of the oldest run that each decision sees. If a decision may see one run
-    only, it is lost if it does not end within its interval, or by the next decision.
+    interval, but less than the age of the oldest run that each decision sees. If a decision may see
+    one run only, it is lost if it does not end within its interval, or by the next decision.
     """
     pipeline, periods = problem.pipeline, min(PATIENCE, problem.window_cycles - 1)
     if every > 1:

@@ -68,7 +68,7 @@ class Targets:
     )
 
 
-@declared("caps.misses")
+@declared("misses")
 class MissCap:
     """Cap on misses: more than m in at most 1 % of the stretches of k cycles."""
 
@@ -76,7 +76,7 @@ class MissCap:
     k: int = key("Consecutive cycles of a stretch.", Bound(1, LONGEST_STRETCH, whole=True))
 
     def __post_init__(self) -> None:
-        require(self.m < self.k, "caps.misses.m", self.m, f"below k = {self.k}")
+        require(self.m < self.k, "misses.m", self.m, f"below k = {self.k}")
 
     @property
     def least_cycles(self) -> int:

@@ -7,11 +7,24 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.live_cell import EXAMPLE
+from tests.cli.live_cell import EXAMPLE, RealCell, invoke
 from tests.cli.small_cell import ROOT, assert_refused, call
 
 CELL = EXAMPLE / "cell.yaml"
 RUN = ROOT / "tests/regression/data/old-runs/simulated"
+
+
+def test_without_keys_it_acts_on_this_computer_alone(tmp_path: Path) -> None:
+    made = RealCell(tmp_path)
+    text = made.file.read_text()
+    assert "address: 127.0.0.1" in text
+    made.file.write_text(text.replace("address: 127.0.0.1", "address: 10.255.0.9", 1))
+    words = ("dash", made.file, "--port", "0", "--no-browser")
+    for more in ((), ("--insecure", "--control")):
+        code, stdout, stderr = invoke(*words, *more)
+        assert code in {1, 2}
+        assert stdout == ""
+        assert "beyond this computer" in stderr
 
 
 def test_a_run_is_not_recorded_again(tmp_path: Path) -> None:

@@ -25,8 +25,9 @@ from dwell.live.wire.keys import Keys
 from dwell.live.wire.messages import Order, Stamped, encode
 from dwell.live.wire.wiring import Role, wire
 from tests.cli.live_cell import EXAMPLE, RealCell, in_window, invoke
+from tests.dash.served import serving, until_state
 from tests.live.host.test_security import Intruder, tls
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, wait_until
 
 PIN = ("live", "pin", "SO")
 
@@ -234,6 +235,31 @@ def test_false_stamps_with_the_stampers_keys_end_no_decisions(cell: SecureCell) 
     assert cell.as_("operator", "live", "pin", "LOC")[0] == 0
     cell.until(lambda status: status["placement"] == "LOC")
     assert "are believed (damaged, or made up)" in cell.logs
+
+
+def test_an_observer_sees_the_page_and_may_not_act(cell: SecureCell) -> None:
+    keys = cell.host / "watcher"
+    code, stdout, stderr = invoke(
+        *("dash", cell.file, "--control", "--keys", keys, "--port", "0", "--no-browser")
+    )
+    assert (code, stdout) == (2, "")
+    assert "observer" in stderr
+    with serving(cell.folder, cell.file, "--keys", keys) as page:
+        until_state(page, lambda found: found["health"] == "ok")
+        wait_until(lambda: page.get("/view?begin=0&end=1e6")["cycles"] > 20)
+        assert page.act("pin", {"candidate": "SO"}).status == 403
+
+
+def test_an_operator_acts_on_the_page_by_name(cell: SecureCell) -> None:
+    with serving(cell.folder, cell.file, "--control", "--keys", cell.host / "operator") as page:
+        assert page.get("/cells")["cells"][0]["certificate"].startswith("operator.")
+        assert page.act("pin", {"candidate": "SO"}).status == 200
+        until_state(page, lambda found: found["placement"] == "SO")
+        assert page.act("unpin", {}).status == 200
+        assert "pin SO by operator." in page.said
+        # As the test before has left it.
+        assert page.act("pin", {"candidate": "LOC"}).status == 200
+        until_state(page, lambda found: found["placement"] == "LOC")
 
 
 def test_bare_connections_end_nothing_and_keep_nobody_out_once_they_have_gone(

@@ -579,8 +579,8 @@ class ControlledCell:
         windows.spent(self.place.node, now_ns, self.place.who, time.process_time_ns())
         # A migration that is still under way at the next decision is given up.
         self._give_up(now_ns)
-        # Miss the decision if less than half of its cycles are known, if no sink was due in them, or
-        # if the next decision is due too.
+        # Miss the decision if less than half of its cycles are known, if no sink was due in them,
+        # or if the next decision is due too.
         next_ns = windows.due_ns(now_ns) if windows.often else None
         late = next_ns is not None and next_ns <= now_ns
         looked = windows.looked

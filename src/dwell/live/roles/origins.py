@@ -1,4 +1,4 @@
-"""Origins: the cycles from which jobs and messages descend, in cells with sampled flows or chains."""
+"""Origins: cycles from which jobs and messages descend, in cells with sampled flows or chains."""
 
 from __future__ import annotations
 

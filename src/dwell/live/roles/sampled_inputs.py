@@ -50,7 +50,7 @@ class SampledInputs:
             yield keys.of(channels.VALUE, self._task, self._place.node, "*")
 
     def receive(self, sample: Arrival, now_ns: int) -> None:
-        """Process a stamp of the cell, or a value from an old node; raise a LiveError if invalid."""
+        """Process a stamp, or a value from an old node; raise a LiveError if invalid."""
         if self._place.channel(sample) is channels.STAMPED:
             self._stamped(self._place.read(channels.STAMPED, sample))
             return

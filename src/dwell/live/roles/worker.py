@@ -89,6 +89,9 @@ class Worker:
         self.book.begin()
         self._warmup = problem.pipeline.tasks[task].warmup_jobs
         overlap = problem.pipeline.open_cycles
+        if not problem.pipeline.sink_rates[task]:
+            # No deadline passes for a task that no sink waits for.
+            overlap = MAX_JOINS * self.routes.due.rates[task]
         self._joins = {
             MAIN: Joins(sources, lambda headers: self.book.ended(headers, DROPPED), overlap),
             SHADOW: Joins(sources, lambda _: None, overlap),
