@@ -63,7 +63,16 @@ LINES, CHARACTERS = 19, 700
 SCREEN_LINES, SCREEN_COLUMNS = 24, 80
 #: Not made here: tuples of a few numbers and names.
 FEW_NUMBERS = {
-    *("Chain", "Endpoint", "Episodes", "Family", "Move", "PairedDifference", "PairedMedian"),
+    *(
+        "Chain",
+        "Endpoint",
+        "Episodes",
+        "Family",
+        "MissCap",
+        "Move",
+        "PairedDifference",
+        "PairedMedian",
+    ),
     *("Phase", "QoS", "Support"),
 }
 

@@ -68,9 +68,9 @@ def small_dags(count: int) -> Iterator[tuple[int, Problem]]:
 
 
 def rated_dags(count: int) -> Iterator[tuple[int, Problem]]:
-    """Yield small cells with several rates and sampled flows, half of them with idle cycles."""
+    """Yield small cells with several rates and sampled flows, some of them with idle cycles."""
     for number, (seed, problem) in enumerate(small_dags(count)):
-        pipeline = with_rates(problem, rng := Random(seed), idle=number % 2 == 0).pipeline
+        pipeline = with_rates(problem, rng := Random(seed)).pipeline
         deadline_ms = pipeline.period_ms * (1.0, 2.5)[number // 2 % 2]
         tasks = {
             name: replace(task, depth=rng.choice([0, 0, 1]))

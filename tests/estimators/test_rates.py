@@ -26,15 +26,17 @@ SEEDS = range(6)
 
 @pytest.mark.parametrize("problem", [from_document(inner_loop()), idle_cell()], ids=["all", "idle"])
 def test_a_price_is_the_mean_of_runs_that_stay(problem: Problem) -> None:
+    windows = 240 if problem.pipeline.has_idle_cycles else 80
+    asked: dict[str, Any] = {"estimator": "profile", "windows": windows}
     for name, price in prices_of(problem).items():
         runs = [
-            summarise(simulate(problem, policy=name, seed=seed, windows=80), problem, {}).row
+            summarise(simulate(problem, policy=name, **asked, seed=seed), problem, {}).row
             for seed in SEEDS
         ]
         l95_ms = np.mean([float(row["l95_ms"]) for row in runs])
         violation_rate = np.mean([float(row["violation_rate"]) for row in runs])
         assert price.l95_ms == pytest.approx(l95_ms, rel=0.02)
-        assert price.violation_rate == pytest.approx(violation_rate, abs=0.01)
+        assert price.violation_rate == pytest.approx(violation_rate, abs=0.015)
 
 
 def test_a_price_with_idle_cycles_is_as_precise_as_others() -> None:

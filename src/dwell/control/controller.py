@@ -204,7 +204,6 @@ class Controller:
         #: The incumbent whose windows are compared with its estimates.
         self._watched, self._watchdog = "", Watchdog(problem.window_cycles)
         self._doubts = Doubts(problem.window_cycles)
-        self._due_cycles = problem.due_cycles
         #: Last measured metrics under each candidate.
         self._seen_under: dict[str, QoS] = {}
         #: Cycles of the current decision, as the engine counts them.
@@ -226,7 +225,6 @@ class Controller:
         self._censor_ms = problem.censor_ms
         #: The policy's objective, else the cell's; its caps decide which candidates are eligible.
         self.objective: Objective = self._policy.objective or problem.objective
-        self._weighs_age = problem.objective.weighs_age
         #: Whether the objective has caps.
         self.has_caps = self.objective.caps != Caps()
 
@@ -254,7 +252,7 @@ class Controller:
             "support": self.supports,
             "fleet": self.coordination is not None,
             "between": self._has_looks,
-            "age": self._weighs_age,
+            "age": self.problem.objective.weighs_age,
             "misses": self.objective.caps.misses is not None,
         }
         return tuple(feature for feature, there in has.items() if there)
@@ -483,7 +481,7 @@ class Controller:
         deviations = self._estimator.deviations(incumbent)
         if deviations is None:
             return
-        played = Expected.of_estimate(estimate, deviations, self._due_cycles)
+        played = Expected.of_estimate(estimate, deviations, self.problem.due_cycles)
         if self._watchdog.compare(seen, played):
             self._doubts.change(incumbent, last_cycle, trusts=self._watchdog.trusts)
 
@@ -674,7 +672,7 @@ class Controller:
 
     def _looked_at(self, observed: QoS) -> tuple[float | None, ...]:
         """Return the metrics of a decision, if a window can have several, and a weighed age."""
-        age_ms = (observed.age_ms,) if self._weighs_age else ()
+        age_ms = (observed.age_ms,) if self.problem.objective.weighs_age else ()
         if not self._has_looks:
             return age_ms
         used = map(observed.utilisation.get, self.resources)
@@ -692,7 +690,7 @@ class Controller:
             *[estimate.violation_rate for estimate in known],
             *[l95_ms for l95_ms, _ in errors],
             *[violation_rate for _, violation_rate in errors],
-            *([estimate.age_ms for estimate in known] if self._weighs_age else ()),
+            *([estimate.age_ms for estimate in known] if self.problem.objective.weighs_age else ()),
             *([estimate.misses for estimate in known] if self.objective.caps.misses else ()),
             *[shares.get(name) for name in self.resources for shares in used],
             *self._capped(known),

@@ -286,6 +286,8 @@ class Pipeline:
     @property
     def due_interval(self) -> int:
         """Most cycles from a cycle in which a sink is due to the next such cycle."""
+        if not any(task.every for task in self.tasks.values()):
+            return 1
         rates = self.rates
         return min(rates[name] for name in self.sinks)
 
