@@ -29,6 +29,7 @@ BENCHMARKS = {
     "rates": ("rated_prices", "measure"),
     "placements": ("placements", "measure"),
     "schedulers": ("placements", "schedulers"),
+    "all": ("all_candidates", "measure"),
     "clairvoyant": ("clairvoyant", "measure"),
     "fleet": ("fleet", "measure"),
     "ledger": ("fleet_ledger", "measure"),

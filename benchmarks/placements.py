@@ -9,10 +9,10 @@ import os
 import random
 import subprocess
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from time import process_time
-from typing import Any
+from typing import Any, NamedTuple
 
 from benchmarks.figures import Figure, Goal, Section
 from dwell.cellfile import from_document
@@ -196,14 +196,41 @@ SOURCES = {
 BYTES = {"transform_front": 200_000, "transform_rear": 200_000, "fusion": 400_000}
 
 
+class Graph(NamedTuple):
+    """A graph of movable tasks between sources and a last task, whose nodes are given.
+
+    Parameters
+    ----------
+    movable : mapping of str to tuple
+        Inputs of each task, and its mean execution time on R1, ms.
+    sources : mapping of str to str
+        Nodes of the sources.
+    last : tuple of str
+        Input of the last task, and its node.
+    sizes : mapping of str to int
+        Bytes of the messages of tasks; 5,000 for the others.
+    """
+
+    name: str
+    movable: Mapping[str, tuple[tuple[str, ...], float]]
+    sources: Mapping[str, str]
+    last: tuple[str, str]
+    sizes: Mapping[str, int]
+
+
 def autoware_graph(nodes: int) -> Problem:
     """Return the graph on two robots, an edge and, with four nodes, a cloud."""
+    return graph_cell(Graph("autoware-graph", AUTOWARE, SOURCES, ("interface", "R1"), BYTES), nodes)
+
+
+def graph_cell(graph: Graph, nodes: int) -> Problem:
+    """Return a graph as a cell; the last task is `drive`."""
     speed = dict(tuple({"R1": 1.0, "R2": 0.9, "E": 0.6, "C": 0.5}.items())[:nodes])
     cores = {"R1": 2, "R2": 2, "E": 2, "C": 8}
     tier = {"R1": "robot", "R2": "robot", "E": "edge", "C": "cloud"}
     delay_ms = {"R1": 0.5, "R2": 0.5, "E": 1.5, "C": 8.0}
     tasks: dict[str, Any] = {
-        name: {"on": {node: {"exec_ms": 0.2}}} for name, node in SOURCES.items()
+        name: {"on": {node: {"exec_ms": 0.2}}} for name, node in graph.sources.items()
     }
     tasks |= {
         name: {
@@ -212,18 +239,19 @@ def autoware_graph(nodes: int) -> Problem:
                 for node, share in speed.items()
             }
         }
-        for name, (_, ms) in AUTOWARE.items()
+        for name, (_, ms) in graph.movable.items()
     }
-    tasks["drive"] = {"on": {"R1": {"exec_ms": 0.2}}}
+    before, where = graph.last
+    tasks["drive"] = {"on": {where: {"exec_ms": 0.2}}}
     flows = [
-        {"from": source, "to": name, "bytes": BYTES.get(source, 5_000)}
-        for name, (sources, _) in AUTOWARE.items()
+        {"from": source, "to": name, "bytes": graph.sizes.get(source, 5_000)}
+        for name, (sources, _) in graph.movable.items()
         for source in sources
     ]
     return from_document(
         {
             "dwell": 1,
-            "name": "autoware-graph",
+            "name": graph.name,
             "period_ms": 100,
             "nodes": {name: {"tier": tier[name], "cores": cores[name]} for name in speed},
             "links": [
@@ -238,8 +266,8 @@ def autoware_graph(nodes: int) -> Problem:
                 if one != other
             ],
             "tasks": tasks,
-            "flows": [*flows, {"from": "interface", "to": "drive", "bytes": 100}],
-            "candidates": {"R1": dict.fromkeys(AUTOWARE, "R1"), "E": dict.fromkeys(AUTOWARE, "E")},
+            "flows": [*flows, {"from": before, "to": "drive", "bytes": 100}],
+            "candidates": {node: dict.fromkeys(graph.movable, node) for node in ("R1", "E")},
             "window_cycles": 100,
         }
     )

@@ -36,6 +36,7 @@ SHAPES = {
     "an execution": cell_form.EXECUTION,
     "a flow": cell_form.FLOW,
     "a chain": cell_form.CHAIN,
+    "a search": cell_form.EVERY_PLACEMENT,
     "a disturbance": cell_form.DISTURBANCE,
     "the objective": cell_form.OBJECTIVE,
     "weights": cell_form.WEIGHTS,
@@ -100,6 +101,8 @@ def words(form: Form) -> str:
             return ", ".join([*(f"`{word}`" for word in means), words(shape)])
         case cell_form.ActuatorForm():
             return "text, `{ros2}`"
+        case cell_form.CandidatesForm():
+            return "name → names, or `all`"
         case cell_form.ProcessForm():
             return "process"
         case fleet_file.PhasesForm():

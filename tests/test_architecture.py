@@ -177,7 +177,7 @@ MAY_IMPORT = {
     "cellfile": ("files", "policies.registry", "estimators.registry"),
     "record": ("cellfile", "files"),
     "control": ("cost", "policies", "estimators"),
-    "sim": ("control", "record", "kernels"),
+    "sim": ("control", "record", "kernels", "estimators.searched_cell"),
     "study": (
         "sim",
         "record",

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 from dwell.errors import MetricError, PlacementError
 from dwell.model.objective import MISSES_SHARE, Objective
 from dwell.model.placement import Placement
-from dwell.model.qos import QoS
+from dwell.model.qos import NO_ERROR, QoS
 
 if TYPE_CHECKING:
     import numpy as np
@@ -37,6 +37,7 @@ __all__ = [
     "ERRORS",
     "GAIN_TOLERANCE",
     "SATURATED",
+    "SELECTED",
     "TierNodes",
     "TierUtilisation",
     "busiest",
@@ -47,6 +48,7 @@ __all__ = [
     "excess",
     "hamming",
     "margin",
+    "margin_errors",
     "price",
     "tier_nodes",
     "tier_utilisation",
@@ -59,6 +61,18 @@ Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 SATURATED = 0.995
 #: Number of standard errors in the `margin` of two estimates.
 ERRORS = 1.0
+#: Number of standard errors of a difference by which the best of K estimates with `QoS.paired` must
+#: be better, by K from 1: sqrt(2 ln K), the largest error to expect of K.
+SELECTED = (
+    0.0,
+    1.1774100225154747,
+    1.4823038073675112,
+    1.6651092223153954,
+    1.7941225779941015,
+    1.8930184728248454,
+    1.9727697022487511,
+    2.039333980337618,
+)
 #: A gain must exceed a threshold by more than this, or rounding could cause a move.
 GAIN_TOLERANCE = 1e-9
 
@@ -254,6 +268,19 @@ def cost_error(
     if weights.age and targets.age_ms is not None:
         known += weights.age * (age_error_ms / targets.age_ms)
     return known
+
+
+def margin_errors(qos: QoS, candidates: int) -> tuple[float, float, float]:
+    """Return the errors of L95 (ms), V_D and age (ms) of an estimate for `margin`.
+
+    Estimates with paired errors have these, `SELECTED` times; the incumbent's are 0. Ages have no
+    paired errors.
+    """
+    if qos.paired is None:
+        return *(qos.error or NO_ERROR), qos.age_error_ms
+    l95_ms, violation_rate = qos.paired
+    errors = SELECTED[min(candidates, len(SELECTED)) - 1]
+    return errors * l95_ms, errors * violation_rate, errors * qos.age_error_ms
 
 
 def margin(one: float, other: float) -> float:

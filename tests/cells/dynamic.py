@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from dwell.cellfile import from_document
 from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.yaml_text import read_yaml
 from dwell.model import Problem
+from dwell.model.scenario import Scenario
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -18,6 +20,12 @@ def dynamic_problem() -> Problem:
     cell, study = (_read(EXAMPLES / name) for name in ("canonical.yaml", "studies/dynamic.yaml"))
     scenarios = {**cell["scenarios"], **study["scenarios"]}
     return from_document({**cell, "scenarios": scenarios})
+
+
+def dynamic_scenarios() -> Mapping[str, Scenario]:
+    """Return the scenarios of the study ``dynamic`` alone."""
+    own = _read(EXAMPLES / "studies/dynamic.yaml")["scenarios"]
+    return {name: dynamic_problem().scenario(name) for name in own}
 
 
 def _read(path: Path) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -55,3 +56,39 @@ def test_several_scenarios(cell: Path) -> None:
 @pytest.mark.parametrize("option", ["--scenario", "--scenarios"])
 def test_an_unknown_scenario_is_refused(cell: Path, option: str) -> None:
     assert_refused(call("candidates", cell, option, "rain"), "unknown scenario 'rain'")
+
+
+def test_check_and_run_search_a_cell_with_all_placements(cell: Path) -> None:
+    cell.write_text(SMALL.replace(NAMED, "candidates: {all: true, keep: 2}\n"), encoding="utf-8")
+    assert list(read_json(call("check", cell, "--json"))["candidates"]) == ["A1", "A2"]
+    assert call("run", cell, "--windows", "8", "--policy", "A2", "--out", "run").exit_code == 0
+    found = json.loads(Path("run/run.json").read_text(encoding="utf-8"))["problem"]["candidates"]
+    assert found == {"all": "found", "keep": 2, "A1": {"plan": "E"}, "A2": {"plan": "R"}}
+    assert call("report", "run").exit_code == 0
+
+
+def test_check_says_why_no_placement_is_feasible(cell: Path) -> None:
+    text = SMALL.replace(NAMED, "candidates: all\n").replace("period_ms: 20", "period_ms: 0.1")
+    cell.write_text(text, encoding="utf-8")
+    assert_refused(call("check", cell), "over the capacity of R")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [["live", "run"], ["agent", "--node", "R", "--cell"], ["controller", "--out", "x", "--cell"]],
+    ids=["run", "agent", "controller"],
+)
+def test_live_cells_refuse_all_placements(cell: Path, command: list[str]) -> None:
+    cell.write_text(SMALL.replace(NAMED, "candidates: all\n"), encoding="utf-8")
+    refused = call(*command, cell)
+    assert refused.exit_code == 2
+    assert "paste the block of `dwell candidates CELL --yaml`" in refused.stderr
+
+
+def test_fleets_refuse_all_placements(cell: Path) -> None:
+    cell.write_text(SMALL.replace(NAMED, "candidates: all\n"), encoding="utf-8")
+    Path("fleet.yaml").write_text(
+        "dwell-fleet: 1\nname: hall\nshared: [E]\ncells:\n  - {cell: small.yaml, count: 2}\n",
+        encoding="utf-8",
+    )
+    assert_refused(call("fleet", "run", "fleet.yaml"), "`candidates: all`, which fleets do not")

@@ -101,3 +101,13 @@ def test_the_margin_is_that_of_the_errors_of_j() -> None:
     assert found.margin(one, certain) == found.margin(exact, one) == pytest.approx(ERRORS * J)
     both = ERRORS * math.hypot(J, weights.latency * 1.5 / 30.0)
     assert found.margin(one, other) == found.margin(other, one) == pytest.approx(both)
+
+
+def test_the_margin_of_paired_errors_grows_with_the_number_of_candidates() -> None:
+    here = replace(qos(), error=(2.0, 0.1), paired=(0.0, 0.0))
+    there = replace(qos(), error=(2.0, 0.1), paired=(0.3, 0.01))
+    names = "ABCDEFGH"
+    for count in range(2, 9):
+        many = Pricing(dict.fromkeys(names[:count], CANDIDATES["LOC"]), OBJECTIVE)
+        expected = math.sqrt(2 * math.log(count)) * (0.3 / 30.0 + 3.0 * 0.01)
+        assert many.margin(there, here) == pytest.approx(ERRORS * expected)

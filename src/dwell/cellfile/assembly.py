@@ -106,11 +106,10 @@ class Assembly:
         links, flows = list(self._links()), list(self._flows())
         timing = self._timing()
         objective = self._objective(nodes)
-        controller = self._section("controller", ControllerSettings)
-        servo = self._servo()
-        live = self._live(timing)
-        scenarios = self._scenarios()
-        candidates = {name: moves for name, moves in entry.candidates.items() if moves is not None}
+        controller, servo = self._section("controller", ControllerSettings), self._servo()
+        live, scenarios = self._live(timing), self._scenarios()
+        named, every = entry.candidates.named, self._made(entry.candidates.every)
+        candidates = _without_none(named)
         called = name if entry.name is None else entry.name
         parts = CellParts(
             nodes=nodes,
@@ -121,7 +120,8 @@ class Assembly:
             scales=dict(entry.scales or {}),
             chains=timing.chains if timing is not None else {},
             candidates=candidates,
-            broken_candidates=[name for name, moves in entry.candidates.items() if moves is None],
+            broken_candidates=[name for name, moves in named.items() if moves is None],
+            every_placement=every,
             scenarios=scenarios,
             controller=controller,
             tiers=objective.tiers if objective is not None else {},
@@ -156,6 +156,7 @@ class Assembly:
             controller=controller,
             servo=servo,
             live=live,
+            every_placement=every,
             folder=self.home,
             **{name: entry.values[name] for name in WINDOWS if name in entry.values},
         )

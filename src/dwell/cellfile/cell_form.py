@@ -65,6 +65,8 @@ from dwell.model import (
 from dwell.model.bounds import LARGEST, MAX_COUNT, NOT_EMPTY, VALUE, Bound, Pattern
 from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
+from dwell.model.every_placement import KEEP, RESERVED, EveryPlacement
+from dwell.model.frozen import FrozenDict
 from dwell.model.pipeline import WORKERS
 from dwell.model.process import DRAWN
 from dwell.model.ros_topics import RosActuator, RosCommands, RosTopic
@@ -451,6 +453,64 @@ LIVE = shape_of(
     instead={"actuators": MappingForm(ActuatorForm())},
 )
 
+# ------------------------------------------------------------------------------ candidates
+
+
+def _search_state(value: Any) -> bool:
+    if value is True or value == "found":
+        return value is not True
+    raise ValueError(not_allowed(value, "true; no candidate can have the name `all`"))
+
+
+def _keep(value: Any) -> int:
+    if isinstance(value, dict):
+        raise ValueError(not_allowed(value, f"{KEEP}; no candidate can have the name `keep`"))
+    return int(NumberForm(KEEP).number(value))
+
+
+EVERY_PLACEMENT = shape_of(
+    EveryPlacement,
+    {},
+    instead={
+        "is_found": WrittenForm("`true`, `found`", _search_state, shown={"enum": [True, "found"]}),
+        "keep": WrittenForm("2 to 8", _keep, shown=NumberForm(KEEP).schema({})),
+    },
+)
+NAMED = MappingForm(MappingForm(NAME), keeps=True, least=1)
+
+
+@dataclass(frozen=True, eq=False)
+class CandidatesForm(Form):
+    """Placements by name, the word `all`, or placements and the keys of a search."""
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return an entry with the placements by name, and with the entry of a search."""
+        if value == "all":
+            value = {"all": True}
+        if not isinstance(value, dict):
+            return refused(value, "`all`, or a mapping", path, faults)
+        search = {name: value[name] for name in RESERVED if name in value}
+        named = NAMED.read(
+            {name: value[name] for name in value if name not in search}, path, faults
+        )
+        every = EVERY_PLACEMENT.read(search, path, faults) if search else None
+        if search and "all" not in search and isinstance(search["keep"], int):
+            faults.add(f"{path}.keep", "needs `all: true` next to it; add it, or remove keep")
+        return candidates_entry(named, every)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the word, or the schema of a mapping."""
+        search = EVERY_PLACEMENT.definition(definitions)["properties"]
+        return {"anyOf": [{"const": "all"}, {**NAMED.schema(definitions), "properties": search}]}
+
+
+def candidates_entry(named: Mapping[str, Any], every: Entry | None = None) -> Entry:
+    """Return the entry of the candidates."""
+    return Entry(CANDIDATES, "candidates", {"named": named, "every": every})
+
+
+CANDIDATES = Shape("Candidates", "Placements the policy may choose.", ())
+
 # ------------------------------------------------------------------------------------ cell
 
 _SECTIONS = ("tasks", "flows", "scales", "chains")
@@ -470,10 +530,13 @@ def _section(name: str, form: Form) -> FormKey:
     return optional(name, form, about.says, tier=about.tier)
 
 
-def _needed(name: str, form: Form) -> FormKey:
+NOTHING: Mapping[str, Any] = FrozenDict()
+
+
+def _needed(name: str, form: Form, stand_in: Any = NOTHING) -> FormKey:
     """A required section of the file."""
     about = _SECTION_KEYS[name]
-    return required(name, form, about.says, {}, tier=about.tier)
+    return required(name, form, about.says, stand_in, tier=about.tier)
 
 
 CELL = FileKind.of(
@@ -492,7 +555,7 @@ CELL = FileKind.of(
     _section("flows", ListForm(FLOW, keeps=True)),
     _section("scales", MappingForm(PROCESS, keeps=True)),
     _section("chains", MappingForm(CHAIN, keeps=True)),
-    _needed("candidates", MappingForm(MappingForm(NAME), keeps=True, least=1)),
+    _needed("candidates", CandidatesForm(), candidates_entry({})),
     _section("scenarios", MappingForm(ListForm(DISTURBANCE, keeps=True), keeps=True)),
     _section("objective", OBJECTIVE),
     _section("controller", CONTROLLER),

@@ -64,8 +64,10 @@ def candidates(
 
 def _named(problem: Problem, best: Sequence[Ranked]) -> Iterator[tuple[str, Placement]]:
     """Yield the placements with their names in the cell file, or as A1, A2, and so on."""
+    from dwell.estimators.searched_cell import free_names
+
     known = {placement: name for name, placement in problem.candidates.items()}
-    free = (name for k in range(1, 10_000) if (name := f"A{k}") not in problem.candidates)
+    free = free_names(problem.candidates)
     for one in best:
         yield known.get(one.placement) or next(free), one.placement
 

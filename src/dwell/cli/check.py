@@ -59,7 +59,7 @@ def check(
         return
     if faults := tuple(class_faults(problem)):
         _refuse(faults, "\n".join(f"{cell}: {fault}" for fault in faults), as_json=as_json)
-    from dwell.estimators import warnings_of
+    from dwell.estimators import searched, warnings_of
     from dwell.estimators.cell_warnings import unpriced
     from dwell.estimators.prices import prices_of
     from dwell.estimators.registry import resolved
@@ -67,6 +67,10 @@ def check(
     from dwell.model.evolve import evolve
     from dwell.policies.registry import estimator_of
 
+    try:
+        problem = searched(problem)
+    except ProblemError as error:
+        _refuse(error.faults, f"{cell}: {error}", as_json=as_json)
     estimator = estimator_of(problem)
     problem = resolved(evolve(problem, {"controller.estimator": estimator}), estimator)
     prices, tried = prices_of(problem, scenario), _shadow_prices(problem)

@@ -88,13 +88,12 @@ def run(
     The run has 300 windows without --windows and --seconds.
     """
     from dwell.cellfile.overrides import load_with
+    from dwell.estimators import searched, unplayed
 
     require_one_length(windows, seconds)
     problem = load_with(cell, settings, traces) if settings else dwell.load(cell, traces=traces)
-    if seconds is not None:
-        windows = windows_of(seconds, problem)
-    windows = windows or 300
-    from dwell.estimators import unplayed
+    problem = searched(problem)
+    windows = windows or (300 if seconds is None else windows_of(seconds, problem))
     from dwell.record import require_free
     from dwell.sim import describe
     from dwell.study.other_placements import PLACEMENTS, other_placements

@@ -9,4 +9,5 @@ from .protocol import Learner as Learner
 from .protocol import Support as Support
 from .registry import by_name as by_name
 from .scaling import Scaling as Scaling
+from .searched_cell import searched as searched
 from .shadow import Shadow as Shadow

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import ClassVar, Self
 
 import numpy as np
@@ -227,8 +227,7 @@ class Learning(Online):
         """Return the number of windows since a decision."""
         return (self._window - decision) / self.problem.decisions_per_window
 
-    def _known_error(self, name: str, rate: float) -> tuple[float, float]:
-        parts = self._parts[name]
+    def _known_error(self, name: str, rate: float, parts: Collection[Part]) -> tuple[float, float]:
         sent_ms = [
             sending_ns(self.problem, part, found.mbps) / 1e6 * found.error
             for part in (parts if self._rates else ())

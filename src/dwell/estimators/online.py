@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 
 from dwell.cost import cost_error, hamming
@@ -110,8 +111,8 @@ class Online(CellEstimator):
     def _otherwise(self) -> Mapping[Part, Floats]:
         """Return the demands of parts that differ from the declared demands (see `Present`)."""
 
-    def _known_error(self, name: str, rate: float) -> tuple[float, float]:
-        """Return the errors of L95 (ms) and V_D of a candidate due to few measured samples."""
+    def _known_error(self, name: str, rate: float, parts: Collection[Part]) -> tuple[float, float]:
+        """Return the errors of L95 (ms) and V_D of a candidate due to few samples of parts."""
         return 0.0, 0.0
 
     def look(self, evidence: Evidence) -> None:
@@ -180,12 +181,45 @@ class Online(CellEstimator):
             one, error = estimates[name], self._stated_error(name)
             known = one.l95_ms, one.violation_rate, one.utilisation, one.cut_from_ms
             estimates[name] = unchecked_qos(*known, error, self._stated_age(name), one.misses)
+        if self.problem.every_placement is not None:
+            return self._paired(names, estimates, incumbent)
         return estimates
+
+    def _paired(
+        self, names: Collection[str], estimates: Mapping[str, QoS], incumbent: str
+    ) -> dict[str, QoS]:
+        """Add the errors of the differences from the incumbent (`QoS.paired`)."""
+        here = estimates[incumbent].error or NO_ERROR
+        paired = {}
+        for name, qos in estimates.items():
+            l95_ms, rate = qos.error or NO_ERROR
+            errors = math.hypot(l95_ms, here[0]), math.hypot(rate, here[1])
+            if name == incumbent:
+                errors = NO_ERROR
+            elif name in names and incumbent in names:
+                # With few common steps, the errors as if independent may be smaller.
+                of = self._difference_errors(name, incumbent)
+                errors = min(errors[0], of[0]), min(errors[1], of[1])
+            paired[name] = replace(qos, paired=errors)
+        return paired
+
+    def _difference_errors(self, name: str, incumbent: str) -> tuple[float, float]:
+        """Return errors of the differences of L95 (ms) and V_D of two simulated candidates.
+
+        The values of parts that both use are the same, and have the same errors.
+        """
+        found = [self._player.difference_errors(name, incumbent)]
+        for one, other in ((name, incumbent), (incumbent, name)):
+            parts = [part for part in self._parts[one] if part not in self._parts[other]]
+            rate = self._player.played(one).violation_rate
+            found.append(self._known_error(one, rate, parts))
+        l95_ms, violation_rate = map(math.hypot, *found)
+        return l95_ms, violation_rate
 
     def _stated_error(self, name: str) -> tuple[float, float]:
         """Return standard errors of L95 (ms) and V_D due to simulated and measured samples."""
         played = self._player.played(name)
-        known = self._known_error(name, played.violation_rate)
+        known = self._known_error(name, played.violation_rate, self._parts[name])
         l95_error_ms, violation_error = played.error or NO_ERROR
         return math.hypot(l95_error_ms, known[0]), math.hypot(violation_error, known[1])
 
@@ -194,7 +228,7 @@ class Online(CellEstimator):
         played = self._player.played(name)
         if played.age_ms is None:
             return None
-        known_ms, _ = self._known_error(name, played.violation_rate)
+        known_ms, _ = self._known_error(name, played.violation_rate, self._parts[name])
         share = known_ms / played.l95_ms if played.l95_ms else 0.0
         return played.age_ms, math.hypot(played.age_error_ms, share * played.age_ms)
 

@@ -158,6 +158,9 @@ def rank(
     if cycles < (interval := problem.pipeline.sink_cycles):
         bound = f"at least {interval}, the cycles from one run to the next of the slowest sink"
         raise SimulationError(f"cycles is {cycles}; it must be {bound}")
+    # A realisation needs at least one candidate.
+    named = problem.candidates or {"first": _first_linked(problem)}
+    problem = replace(problem, candidates=named, every_placement=None)
     samples = [_sample(problem, scenario, cycles, seed) for scenario in scenarios]
     found = _Search(problem, samples, scenarios, top, most)
     found.run()
@@ -247,8 +250,7 @@ class _Search:
         """Return the best placements, and how they were found."""
         best = self._best
         if not best:
-            reasons = ", ".join(f"{number} {reason}" for reason, number in self._pruned.items())
-            raise PlacementError(f"no placement of {self._problem.name!r} is feasible: {reasons}")
+            raise _infeasible(self._problem, self._pruned)
         gap = max(1.0 - self._left / best[0].cost, 0.0) if best[0].cost else 0.0
         return Ranking(
             best=best,
@@ -333,7 +335,7 @@ class _Search:
         nodes = one.partials[0].nodes
         name = self._order[len(nodes)]
         for node in self._on[name]:
-            if not self._is_linked(nodes, name, node):
+            if not is_linked(self._problem, nodes, name, node):
                 self._pruned["without a link"] += self._completions(len(nodes) + 1)
                 continue
             used = set(nodes.values())
@@ -361,12 +363,38 @@ class _Search:
         """Return how many placements have the same nodes of the first tasks."""
         return math.prod(len(self._on[name]) for name in self._order[placed:])
 
-    def _is_linked(self, nodes: Mapping[str, str], name: str, node: str) -> bool:
-        links = self._problem.fabric.links
-        return all(
-            nodes[flow.source] == node or f"{nodes[flow.source]}->{node}" in links
-            for flow in self._problem.pipeline.inputs(name)
-        )
+
+def is_linked(problem: Problem, nodes: Mapping[str, str], name: str, node: str) -> bool:
+    """Return whether a task on a node is linked to its sources, whose nodes are known."""
+    links = problem.fabric.links
+    return all(
+        nodes[flow.source] == node or f"{nodes[flow.source]}->{node}" in links
+        for flow in problem.pipeline.inputs(name)
+    )
+
+
+def _first_linked(problem: Problem) -> Placement:
+    """Return a placement whose flows all have links; raise PlacementError if there is none."""
+    tasks, order = problem.pipeline.tasks, problem.pipeline.topological()
+    pruned: Counter[str] = Counter()
+    stack: list[dict[str, str]] = [{}]
+    for _ in range(MOST_NODES):
+        if not stack:
+            break
+        nodes = stack.pop()
+        if len(nodes) == len(order):
+            return Placement({name: nodes[name] for name in tasks})
+        name = order[len(nodes)]
+        on = [node for node in tasks[name].on if is_linked(problem, nodes, name, node)]
+        rest = math.prod(len(tasks[other].on) for other in order[len(nodes) + 1 :])
+        pruned["without a link"] += (len(tasks[name].on) - len(on)) * rest
+        stack += [{**nodes, name: node} for node in reversed(on)]
+    raise _infeasible(problem, pruned)
+
+
+def _infeasible(problem: Problem, pruned: Mapping[str, int]) -> PlacementError:
+    reasons = ", ".join(f"{number} {reason}" for reason, number in pruned.items())
+    return PlacementError(f"no placement of {problem.name!r} is feasible: {reasons}")
 
 
 def twins(problem: Problem) -> Iterator[tuple[str, ...]]:

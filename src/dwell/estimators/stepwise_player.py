@@ -26,12 +26,14 @@ from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_m
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
-from dwell.model.qos import QoS, unchecked_qos
+from dwell.model.qos import NO_ERROR, QoS, unchecked_qos
 from dwell.model.shadow_plan import ShadowFraction
 from dwell.model.stretches import share_over
 
 #: Most steps in a candidate's price; the same while the measured demands change.
 KEPT, RECENT = 24, 6
+#: Least number of common steps of two candidates for the error of their difference.
+LEAST_PAIRS = 3
 #: Limit of the correlation of successive steps; more would be a drift.
 MOST_ALIKE = 0.9
 
@@ -48,10 +50,14 @@ class _Twin:
         self.steps = Steps(kept, PAIRS + 1 + resources)
         #: Mean age of each step (ms), followed by its value as declared; then zeros.
         self.ages = Steps(kept, PAIRS)
+        #: Last cycle of each step, counted over all repetitions of the realisation.
+        self.ends: deque[int] = deque(maxlen=kept)
         #: Latencies of the cycles of each step; which of the cycles with a sink missed.
         self.latency_ns: deque[Ints] = deque(maxlen=kept)
         self.missed: deque[NDArray[np.bool_]] = deque(maxlen=kept)
         self.price: QoS | None = None
+        #: Whether the price's L95 and V_D are differences from the declared ones.
+        self.is_relative = False, False
 
     def add(
         self,
@@ -59,10 +65,12 @@ class _Twin:
         ages_ms: Sequence[float],
         latency_ns: Ints,
         missed: NDArray[np.bool_],
+        end: int,
     ) -> None:
         """Add a step; drop the oldest beyond the most."""
         self.steps.add(means)
         self.ages.add(ages_ms)
+        self.ends.append(end)
         self.latency_ns.append(latency_ns)
         self.missed.append(missed)
 
@@ -72,6 +80,7 @@ class _Twin:
         self.ages.keep(most)
         while len(self.latency_ns) > most:
             self.latency_ns.popleft()
+            self.ends.popleft()
             self.missed.popleft()
 
 
@@ -187,7 +196,7 @@ class StepwisePlayer:
             due = tables.outcome[0, cycles] != CycleOutcome.IDLE
             played = self._pipeline, self.declared.realisation.release_ns, CellArrays(twin.arrays)
             missed = (latency_ns > self._pipeline.deadline_ns) | over_age(*played, cycles)
-            twin.add(means, ages_ms, latency_ns, missed[due])
+            twin.add(means, ages_ms, latency_ns, missed[due], self._offset + twin.cursor)
         twin.price = None
         self.cycles += self._step * self._window
 
@@ -195,7 +204,7 @@ class StepwisePlayer:
         """Return the means of a candidate with errors; the utilisation is the cell's own."""
         twin = self._twins[name]
         if twin.price is None:
-            twin.price = self._price(name, twin.steps)
+            twin.price = self._price(name, twin)
         return twin.price
 
     def deviations(self, name: str) -> tuple[float, float]:
@@ -215,13 +224,40 @@ class StepwisePlayer:
         latency_ns = np.concatenate(self._twins[name].latency_ns)
         return tail_error_ms(latency_ns, self._censor_ms, off)
 
-    def _price(self, name: str, steps: Steps) -> QoS:
+    def difference_errors(self, name: str, other: str) -> tuple[float, float]:
+        """Return the errors of the differences of L95 (ms) and V_D of two simulated candidates.
+
+        The differences are those of the steps that both have, which are of the same cycles.
+        """
+        pair = name, other
+        errors = [self.played(one).error or NO_ERROR for one in pair]
+        twins = [self._twins[one] for one in pair]
+        common = [end for end in twins[0].ends if end in twins[1].ends]
+        if len(common) < LEAST_PAIRS:
+            l95_ms, rate = map(math.hypot, *errors)
+            return l95_ms, rate
+        tables = [twin.steps.table[list(map(twin.ends.index, common))] for twin in twins]
+        prices = [self.prices[one] for one in pair]
+        known = [(price.l95_error_ms, price.violation_error) for price in prices]
+        l95, rates = (
+            _paired(
+                [table[:, 2 * metric : 2 * metric + 2] for table in tables],
+                [twin.is_relative[metric] for twin in twins],
+                [of[metric] for of in known],
+            )
+            for metric in (0, 1)
+        )
+        few = unseen_error(rates[1], len(common) * self._step * self._window)
+        return l95[0], max(rates[0], few)
+
+    def _price(self, name: str, twin: _Twin) -> QoS:
+        steps = twin.steps
         count, known = len(steps), self.prices[name]
         l95, rates, (uncut, *own) = steps.sums()
-        l95_ms, l95_error_ms = _estimated(
+        l95_ms, l95_error_ms, l95_is_relative = _estimated(
             l95, count, known.l95_ms, known.l95_error_ms, usual=self._usual[name][0]
         )
-        violation_rate, violation_error = _estimated(
+        violation_rate, violation_error, rate_is_relative = _estimated(
             rates,
             count,
             known.violation_rate,
@@ -229,6 +265,7 @@ class StepwisePlayer:
             usual=self._usual[name][1],
             cycles=count * self._step * self._window,
         )
+        twin.is_relative = l95_is_relative, rate_is_relative
         l95_ms = min(l95_ms, self._censor_ms)
         uncut_ms = max(uncut / count, l95_ms)
         shares = [share / count for share in own]
@@ -249,7 +286,7 @@ class StepwisePlayer:
         """Return the mean age of a candidate and its error, ms."""
         steps = self._twins[name].ages
         usual = float(self.declared.age_ms[name][1:].std()) / math.sqrt(self._step)
-        age_ms, error_ms = _estimated(steps.sums()[0], len(steps), *known, usual=usual)
+        age_ms, error_ms, _ = _estimated(steps.sums()[0], len(steps), *known, usual=usual)
         return min(age_ms, self._censor_ms), error_ms
 
     def _share_over(self, name: str) -> float | None:
@@ -271,25 +308,53 @@ def _estimated(
     *,
     usual: float,
     cycles: int | None = None,
-) -> tuple[float, float]:
-    """Return the mean over `count` steps, with its standard error.
+) -> tuple[float, float, bool]:
+    """Return the mean over `count` steps, its standard error, and whether it is relative.
 
     The same realisation is also simulated as declared; longer simulations give its expected value
     `known`, with error `known_error`. If the difference between the two varies less than the
-    measured conditions do, its mean is added to `known` (a control variate; DOI
-    10.1287/opre.30.5.961). `usual` is the standard deviation of a step as declared, since few steps
-    may vary too little; `cycles` is the number of cycles if the mean is a share of cycles.
+    measured conditions do, its mean is added to `known`: the mean is relative (a control variate;
+    DOI 10.1287/opre.30.5.961). `usual` is the standard deviation of a step as declared, since few
+    steps may vary too little; `cycles` is the number of cycles if the mean is a share of cycles.
     """
     mean, squares, products, more, more_squares, more_products, apart = steps
     if not apart:
-        return known, known_error
+        return known, known_error, True
     error = _error(count, mean, squares, products, usual)
     more_error = _error(count, more, more_squares, more_products)
     if cycles is not None:
         error = max(error, unseen_error(mean, cycles))
         more_error = max(more_error, unseen_error(apart / count, cycles))
     more_error = math.hypot(more_error, known_error)
-    return (max(known + more, 0.0), more_error) if more_error < error else (mean, error)
+    if more_error < error:
+        return max(known + more, 0.0), more_error, True
+    return mean, error, False
+
+
+def _paired(
+    tables: Sequence[Floats], are_relative: Sequence[bool], known: Sequence[float]
+) -> tuple[float, float]:
+    """Return the error of the difference of two means over the same steps, and its mean size.
+
+    Parameters
+    ----------
+    tables : sequence of float64 array, shape (steps, 2)
+        A metric of each candidate, and the same as declared.
+    are_relative : sequence of bool
+        Whether each mean is relative (see `_estimated`).
+    known : sequence of float
+        Error of the declared value of each.
+    """
+    one, other = (
+        table[:, 0] - table[:, 1] if is_relative else table[:, 0]
+        for table, is_relative in zip(tables, are_relative, strict=True)
+    )
+    apart = one - other
+    off = apart - apart.mean()
+    squares, products = float((off * off).sum()), float((off[1:] * off[:-1]).sum())
+    error = _error(len(apart), float(apart.mean()), squares, products)
+    declared = (of for of, is_relative in zip(known, are_relative, strict=True) if is_relative)
+    return math.hypot(error, *declared), float(np.abs(apart).mean())
 
 
 def _mean(windows: Floats | Ints) -> float:

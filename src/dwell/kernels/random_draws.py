@@ -287,6 +287,11 @@ class Drawing:
         disturbances: Scenario = (),
         every_hop: bool = False,
     ) -> None:
+        if problem.is_searched:
+            raise ProblemError(
+                f"cell {problem.name!r} has `candidates: all`; search first, by "
+                "dwell.estimators.searched(problem)"
+            )
         self.problem, self.name, self.shared = problem, scenario, shared
         own = (item for item in problem.scenario(scenario) if not self._is_shared(item))
         self.scenario: Scenario = (*own, *disturbances)

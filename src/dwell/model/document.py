@@ -69,10 +69,7 @@ def to_document(problem: Problem) -> Document:
                 name: _part(f"chains.{name}", chain) for name, chain in pipeline.chains.items()
             }
             or None,
-            "candidates": {
-                name: relocated(placement, pipeline.tasks)
-                for name, placement in problem.candidates.items()
-            },
+            "candidates": _candidates(problem),
             "scenarios": {
                 name: [_disturbance(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
                 for name, items in problem.scenarios.items()
@@ -172,6 +169,14 @@ def _trace(trace: Trace) -> Document:
 def relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
     """Return a placement without anchored tasks, as in a document."""
     return {name: node for name, node in placement.items() if not tasks[name].anchored}
+
+
+def _candidates(problem: Problem) -> Document:
+    every, tasks = problem.every_placement, problem.pipeline.tasks
+    placements = {name: relocated(one, tasks) for name, one in problem.candidates.items()}
+    if every is None:
+        return placements
+    return {"all": "found" if every.is_found else True, "keep": every.keep, **placements}
 
 
 def _node(node: Node) -> Document:

@@ -259,6 +259,11 @@ def fleet_faults(kinds: Sequence[Kind], shared: Sequence[str], phases: Phases) -
         if cell is not None and known.setdefault(cell.name, (place, cell))[1] != cell:
             message = f"{cell.name!r} is the name of another cell, too; give it its own"
             yield Fault(f"cells[{place}].cell", message)
+    for place, (_, cell) in enumerate(kinds):
+        if cell is not None and cell.is_searched:
+            message = f"{cell.name} has `candidates: all`, which fleets do not support"
+            remedy = "paste the block of `dwell candidates CELL --yaml`"
+            yield Fault(f"cells[{place}].cell", f"{message}; {remedy}")
     for i, name in enumerate(shared):
         if name in shared[:i]:
             yield Fault(f"shared[{i}]", f"{name!r} is given twice; name each once")

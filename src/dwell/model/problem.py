@@ -13,6 +13,7 @@ from dwell.model.bounds import MAX_COUNT, Bound, counted, require
 from dwell.model.chain import Chain, ChainPatience
 from dwell.model.controller_settings import USUAL_DWELL, ControllerSettings
 from dwell.model.declaration import declared, key
+from dwell.model.every_placement import EveryPlacement
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
 from dwell.model.instants import require_length
@@ -26,6 +27,8 @@ from dwell.model.servo import Servo
 
 #: Default share of the cycles for each alternative, unless the shares add up to more than 1.
 SHADOWED = 0.05
+#: The same for all alternatives together, where a search adds candidates.
+SHADOWED_TOGETHER = 0.1
 
 
 class Drawn(NamedTuple):
@@ -79,6 +82,8 @@ class Problem(Displayed):
     live: LiveSettings = key(
         "Hosts and habits of the live runtime.", default_factory=LiveSettings, tier="first"
     )
+    #: Search that adds the cheapest of all placements to the candidates.
+    every_placement: EveryPlacement | None = None
     #: The cell file's folder, searched first for classes named ``package.module:Class``. Equality
     #: ignores it.
     folder: str | None = field(default=None, compare=False, repr=False)
@@ -156,6 +161,7 @@ class Problem(Displayed):
             scales=pipeline.scales,
             chains=pipeline.chains,
             candidates=self.candidates,
+            every_placement=self.every_placement,
             scenarios={
                 name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
                 for name, items in self.scenarios.items()
@@ -178,8 +184,13 @@ class Problem(Displayed):
 
     @property
     def initial(self) -> str:
-        """Name of the candidate that a run starts with."""
-        return self.controller.initial or next(iter(self.candidates))
+        """Name of the candidate that a run starts with; empty if only a search finds it."""
+        return self.controller.initial or next(iter(self.candidates), "")
+
+    @property
+    def is_searched(self) -> bool:
+        """Whether a search must still add candidates (`dwell.estimators.searched`)."""
+        return self.every_placement is not None and not self.every_placement.is_found
 
     def policy_and_estimator(self, name: str) -> tuple[str, str | None]:
         """Split a name as ``cusum+corrected`` into policy and estimator.
@@ -292,12 +303,15 @@ class Problem(Displayed):
     def shadow_fraction(self) -> float:
         """Largest share of the cycles also sent through each alternative, if the estimator does so.
 
-        With `auto` 0.05, or 1/(alternatives) if that is less; see `dwell.estimators.shadow_price`.
+        With `auto` 0.05, or 1/(alternatives) if that is less, 0.1/(alternatives) if a search adds
+        candidates; see `dwell.estimators.shadow_price`.
         """
         given = self.controller.shadow_fraction
         if not isinstance(given, str):
             return given
-        return min(SHADOWED, 1 / max(len(self.candidates) - 1, 1))
+        alternatives = max(len(self.candidates) - 1, 1)
+        together = 1.0 if self.every_placement is None else SHADOWED_TOGETHER
+        return min(SHADOWED, together / alternatives)
 
     @property
     def controller_node(self) -> str:

@@ -48,6 +48,9 @@ class QoS:
     misses : float, optional
         Share of the stretches of k cycles with more than m misses, in [0, 1] (``caps.misses``);
         None if unknown, which respects the cap.
+    paired : tuple of float, optional
+        In a cell whose candidates come from a search: standard errors of the differences of
+        `l95_ms` and `violation_rate` from the incumbent's estimates on the same samples.
 
     Raises
     ------
@@ -63,6 +66,7 @@ class QoS:
     age_ms: float | None = None
     age_error_ms: float = 0.0
     misses: float | None = None
+    paired: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         l95_ms, cut_from_ms = self.l95_ms, self.cut_from_ms
@@ -83,8 +87,8 @@ class QoS:
                 )
             if cut_from_ms == l95_ms:
                 object.__setattr__(self, "cut_from_ms", None)
-        if self.error is not None:
-            for metric, value in zip(("l95_ms", "violation_rate"), self.error, strict=True):
+        for errors in (one for one in (self.error, self.paired) if one is not None):
+            for metric, value in zip(("l95_ms", "violation_rate"), errors, strict=True):
                 if not 0 <= value < INFINITY:
                     raise MetricError(
                         f"error of {metric} is {value!r}; it must be finite and at least 0"
@@ -117,6 +121,7 @@ class QoS:
     _set_age_ms,
     _set_age_error_ms,
     _set_misses,
+    _set_paired,
 ) = (getattr(QoS, name).__set__ for name in QoS.__match_args__)
 
 
@@ -128,6 +133,7 @@ def unchecked_qos(
     error: tuple[float, float] | None = None,
     age: tuple[float, float] | None = None,
     misses: float | None = None,
+    paired: tuple[float, float] | None = None,
 ) -> QoS:
     """Make a QoS without checks, in a third of the time.
 
@@ -144,6 +150,7 @@ def unchecked_qos(
     _set_age_ms(qos, age_ms)
     _set_age_error_ms(qos, age_error_ms)
     _set_misses(qos, misses)
+    _set_paired(qos, paired)
     return qos
 
 

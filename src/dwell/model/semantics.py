@@ -18,6 +18,7 @@ from dwell.model import table_columns
 from dwell.model.bounds import CLASS_PATH, shown
 from dwell.model.chain import Chain, chain_faults
 from dwell.model.controller_settings import ControllerSettings
+from dwell.model.every_placement import EveryPlacement, search_faults
 from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Tier
@@ -70,6 +71,7 @@ class CellParts:
     chains: Mapping[str, Chain] = field(default_factory=dict)
     candidates: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     broken_candidates: Iterable[str] = ()
+    every_placement: EveryPlacement | None = None
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
     controller: ControllerSettings | None = None
     tiers: Mapping[str, Tier] = field(default_factory=dict)
@@ -301,7 +303,11 @@ def _cycle(flows: Sequence[Flow]) -> list[str]:
 
 
 def _candidates(parts: CellParts) -> Iterator[Fault]:
-    if not parts.candidates and not list(parts.broken_candidates):
+    settings, every = parts.controller, parts.every_placement
+    fallbacks = settings.fallbacks if settings is not None else ()
+    yield from search_faults(every, parts.candidates, fallbacks)
+    is_searched = every is not None and not every.is_found
+    if not (is_searched or parts.candidates or list(parts.broken_candidates)):
         yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
     for name, moves in parts.candidates.items():
         path = f"candidates.{name}"

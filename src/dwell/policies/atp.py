@@ -37,13 +37,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from dwell.cost import TierUtilisation, cost_error, exceeds, margin, price
+from dwell.cost import TierUtilisation, cost_error, exceeds, margin, margin_errors, price
 from dwell.errors import MetricError
 from dwell.model.bounds import EVERY_MS
 from dwell.model.objective import Objective
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
-from dwell.model.qos import NO_ERROR, Decision, QoS
+from dwell.model.qos import Decision, QoS
 from dwell.policies.atp_thresholds import ATPThresholds
 from dwell.policies.incumbent import CandidatePolicy, check_parameter
 
@@ -176,7 +176,7 @@ class ATP(ATPThresholds):
 
     def _shown(self, qos: QoS) -> _Shown:
         used = self._pricing.used(qos)
-        l95_error_ms, _ = qos.error or NO_ERROR
+        l95_error_ms, *_ = margin_errors(qos, len(self.candidates))
         return _Shown(qos.l95_ms, l95_error_ms, used)
 
     def _error(self, shown: _Shown) -> float:

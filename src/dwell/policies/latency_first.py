@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dwell.cost import exceeds, margin
-from dwell.model.qos import NO_ERROR, Decision, QoS
+from dwell.cost import exceeds, margin, margin_errors
+from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import CandidatePolicy
 from dwell.policies.pricing import explain_estimate
 
@@ -43,7 +43,7 @@ class LatencyFirst(CandidatePolicy):
             raise
         costs = self._costs(known)
         here, there = known[now], known[best]
-        errors = [(one.error or NO_ERROR)[0] for one in (here, there)]
+        errors = [margin_errors(one, len(self.candidates))[0] for one in (here, there)]
         if best == now or not exceeds(here.l95_ms - lowest, margin(*errors)):
             return self._stay("hold", costs), None
         return self._move(best, "migrate", costs), None

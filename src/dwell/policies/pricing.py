@@ -18,6 +18,7 @@ from dwell.cost import (
     excess,
     hamming,
     margin,
+    margin_errors,
     price,
     tier_nodes,
     weighed_age_ms,
@@ -144,10 +145,8 @@ class Pricing:
         """Return the least difference in J of two estimates that exceeds their error."""
         if one.error is None and other.error is None:
             return 0.0
-        return margin(
-            cost_error(one.error, self.objective, one.age_error_ms),
-            cost_error(other.error, self.objective, other.age_error_ms),
-        )
+        errors = (margin_errors(qos, len(self.candidates)) for qos in (one, other))
+        return margin(*(cost_error((l95, rate), self.objective, age) for l95, rate, age in errors))
 
     def eligible(self, estimates: Mapping[str, QoS]) -> tuple[list[str], bool]:
         """Return the candidates to choose from, and whether they respect the caps.

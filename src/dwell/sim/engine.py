@@ -20,6 +20,7 @@ from dwell.control import (
     plain_rule,
 )
 from dwell.errors import SimulationError
+from dwell.estimators.searched_cell import searched
 from dwell.kernels.advance import LoggedCycles, play
 from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
 from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, cell_of, kind_of
@@ -79,6 +80,7 @@ def simulate(
     ProblemError, PolicyError, TraceError, SimulationError
         If a name is unknown, or the realisation cannot be sampled.
     """
+    problem = searched(problem)
     realisation = draw(problem, scenario=scenario, seed=seed, windows=windows)
     return simulate_realisation(
         problem, realisation, policy=policy, estimator=estimator, jobs=jobs, guard=guard
@@ -102,6 +104,7 @@ def simulate_realisation(
     by_window : bool
         Whether Python decides after every window, even if the kernel could; the Run is the same.
     """
+    problem = searched(problem)
     _check_fit(problem, realisation)
     chains = tuple(problem.pipeline.chains)
     require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates), chains)
@@ -143,6 +146,7 @@ def describe(
     ProblemError, PolicyError
         If a name is unknown.
     """
+    problem = searched(problem)
     problem.scenario(scenario)
     controller = Controller(problem, policy, estimator)
     meta = meta_of(controller, scenario=scenario, seed=seed, windows=windows, guard=guard)

@@ -12,6 +12,7 @@ import numpy as np
 from dwell.cellfile.study_file import Value, read_study
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import SimulationError
+from dwell.estimators.searched_cell import searched
 from dwell.model import FrozenDict, Problem
 from dwell.model.bounds import counted
 from dwell.model.fleet import Fleet
@@ -188,6 +189,11 @@ class Study:
     def __post_init__(self) -> None:
         object.__setattr__(self, "labels", FrozenDict(self.labels))
         object.__setattr__(self, "metrics", FrozenDict(self.metrics))
+        points = tuple(
+            point if point.fleet else replace(point, problem=searched(point.problem))
+            for point in self.points
+        )
+        object.__setattr__(self, "points", points)
         names = tuple(contender.name for contender in self.contenders)
         _require_each_once("points", [dict(point.values) for point in self.points])
         _require_each_once("scenarios", self.scenarios)

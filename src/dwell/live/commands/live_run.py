@@ -32,6 +32,7 @@ from dwell.live.local.playing import (
     play_on,
 )
 from dwell.live.local.timeline import timeline_of
+from dwell.live.wire.wiring import require_candidates
 from dwell.model import Problem
 from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
@@ -69,6 +70,7 @@ def run_live(
     stage, a process does not start, or the folder has other content.
     """
     problem = dwell.load(file)
+    require_candidates(problem)
     if policy is not None or estimator is not None:
         names = (policy or problem.controller.policy, estimator)
         problem = problem.under("+".join(name for name in names if name is not None))

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Literal, TypeAlias
 
-from dwell.errors import LiveError
+from dwell.errors import Fault, LiveError, ProblemError
 from dwell.live.wire.local_addresses import running_elsewhere
 from dwell.live.wire.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.wire.transport import Lane
@@ -153,8 +153,10 @@ def roles(problem: Problem) -> tuple[Role, ...]:
     """Return every process of a cell, in the order of the ports.
 
     Later processes connect to earlier processes. Processes that rarely restart are first, then the
-    workers along the flows, and last the controller, which may start and stop at any time.
+    workers along the flows, and last the controller, which may start and stop at any time. Raises a
+    ProblemError if a search must still add candidates.
     """
+    require_candidates(problem)
     pipeline = problem.pipeline
     order = pipeline.topological()
     stamper = problem.stamper_node
@@ -333,6 +335,14 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             samples = any(flow.sampled for flow in problem.pipeline.inputs(other.task))
             return stops or (other.kind == "worker" and (samples or not task.anchored))
     return False
+
+
+def require_candidates(problem: Problem) -> None:
+    """Raise a ProblemError if a search must still add candidates."""
+    if problem.is_searched:
+        message = f"not supported in the live cell {problem.name}"
+        remedy = "paste the block of `dwell candidates CELL --yaml`"
+        raise ProblemError([Fault("candidates.all", f"{message}; {remedy}")])
 
 
 def _require_latencies(problem: Problem) -> None:
