@@ -67,6 +67,7 @@ from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
 from dwell.model.pipeline import WORKERS
 from dwell.model.process import DRAWN
+from dwell.model.replicated import Replicated
 from dwell.model.ros_topics import RosActuator, RosCommands, RosTopic
 from dwell.policies.registry import REGISTRY as POLICIES
 
@@ -384,6 +385,25 @@ TASK = shape_of(
     ),
 )
 FLOW, CHAIN = shape_of(Flow, {}), shape_of(Chain, {})
+REPLICATED = shape_of(Replicated, {})
+PLACED = MappingForm(NAME)
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateForm(Form):
+    """A placement: relocatable task to node; or `{replicas}`, two other candidates."""
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return a dict of nodes by task, or the entry of replicas."""
+        # A task may have the name `replicas`.
+        if isinstance(value, dict) and isinstance(value.get("replicas"), list):
+            return REPLICATED.read(value, path, faults)
+        return PLACED.read(value, path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the schemas of both."""
+        return {"anyOf": [PLACED.schema(definitions), REPLICATED.schema(definitions)]}
+
 
 # ------------------------------------------------------------- scenarios, objective, control
 
@@ -492,7 +512,7 @@ CELL = FileKind.of(
     _section("flows", ListForm(FLOW, keeps=True)),
     _section("scales", MappingForm(PROCESS, keeps=True)),
     _section("chains", MappingForm(CHAIN, keeps=True)),
-    _needed("candidates", MappingForm(MappingForm(NAME), keeps=True, least=1)),
+    _needed("candidates", MappingForm(CandidateForm(), keeps=True, least=1)),
     _section("scenarios", MappingForm(ListForm(DISTURBANCE, keeps=True), keeps=True)),
     _section("objective", OBJECTIVE),
     _section("controller", CONTROLLER),
