@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 27_514, "live": 16_004, "lab": 6_819}
+MOST = {"simulator": 27_565, "live": 16_026, "lab": 6_819}
 
 
 def code_lines(text: str) -> int:

@@ -180,6 +180,41 @@ def test_a_task_with_sampled_inputs_alone_is_released_like_a_source() -> None:
     assert log.samples[-1] is not None
 
 
+def test_three_rates_survive_the_death_of_each_worker() -> None:
+    on: dict[str, Any] = {"R": {"exec_ms": 1}}
+    spare: dict[str, Any] = {"R": {"exec_ms": 1, "standby": 1}}
+    tasks: dict[str, Any] = {
+        "camera": {"every": 2 * SLOW, "on": on},
+        "lidar": {"every": SLOW, "on": on},
+        "imu": {"on": on},
+        "detect": {"on": on},
+        "control": {"on": spare},
+    }
+    flows = [
+        {"from": "camera", "to": "detect"},
+        {"from": "imu", "to": "control"},
+        {"from": "detect", "to": "control", "sampled": True},
+        {"from": "lidar", "to": "control", "sampled": True},
+    ]
+    problem = sampling(tasks=tasks, flows=flows, candidates={"LOC": {}}, controller={"on": "E"})
+    world, log = logged(problem)
+    world.run(500)
+    world.kill("detect@R")
+    world.run(300)
+    begun = len(world.cycles)
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}
+    assert log.samples[-1] == log.samples[-20]
+    world.start("detect@R")
+    world.kill("control@R")
+    world.run(500)
+    most = problem.controller.guard_cycles + 1
+    gaps = {later - earlier - 1 for earlier, later in pairwise(world.cycles)}
+    assert max(gaps) <= most
+    assert len(world.cycles) > begun + 40
+    assert log.inputs[-1].keys() == {"imu", "detect", "lidar"}
+    assert log.samples[-1] != log.samples[-20]
+
+
 #: Messages that arrive after those of the next run.
 OVERTAKEN = NetworkConditions(reordering=1.0, reorder_ns=80 * MS)
 
@@ -258,6 +293,20 @@ def test_recorded_ages_are_those_of_the_jobs(tmp_path: Path) -> None:
         assert l95_ms == pytest.approx(sorted(ages)[18])
         assert missed == sum(age > 50 for age in ages) / 20
     assert any(missed for _, _, missed in windows)
+
+
+def test_a_cycle_whose_data_are_too_old_is_missed() -> None:
+    world, _ = logged(sampling(chains=CHAINS), policy=Staying())
+    world.run(1_000)
+    windows = columns(world, "windows", "first_cycle", "violation_rate", "age_missed_see-act")
+    windows = windows[1:]
+    # At the command just before a new detection the picture is over 50 ms old.
+    assert {missed for _, _, missed in windows} == {0.2}
+    assert {rate for _, rate, _ in windows} == {0.2}
+    rows = columns(world, "cycles", "number", "missed")[windows[0][0] :]
+    assert {number % SLOW for number, missed in rows if missed} == {0}
+    seen = columns(world, "decisions", "seen_violation_rate")
+    assert max(rate for (rate,) in seen) == 0.2
 
 
 def test_the_guard_leaves_a_placement_whose_detector_is_dead() -> None:

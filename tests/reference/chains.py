@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-from dwell.model import Problem
+from dwell.model import Chain, Problem
 from tests.reference.rates import Rates
 from tests.reference.simulator import Result
 
@@ -45,6 +45,24 @@ def actuations(
     for at_ns, cycle in done:
         origin = min(rates.descent(taken, start, end, cycle), default=origin)
         found.append(Actuation(cycle, at_ns, at_ns - release_ns[origin]))
+    return found
+
+
+def bound_ns(chain: Chain) -> float:
+    """Return the bound on a chain's age, infinite without one."""
+    return chain.max_age_ms if math.isinf(chain.max_age_ms) else round(chain.max_age_ms * 1e6)
+
+
+def over_age(problem: Problem, result: Result, release_ns: list[int]) -> dict[int, int]:
+    """Return the cycles whose age at an actuation of a chain is over its bound, and that instant.
+
+    By section "Chains": the first such instant counts.
+    """
+    found: dict[int, int] = {}
+    for chain in problem.pipeline.chains.values():
+        for one in actuations(problem, result, release_ns, chain.source, chain.target):
+            if one.age_ns > bound_ns(chain):
+                found[one.cycle] = min(one.at_ns, found.get(one.cycle, one.at_ns))
     return found
 
 

@@ -12,9 +12,22 @@ import pytest
 import dwell
 from dwell.model import Chain, Problem, Targets, Weights
 from dwell.model.chain import behind
-from tests.reference.chains import actuations, age_l95_ms, completions, mean_age_ms
+from tests.reference.chains import (
+    actuations,
+    age_l95_ms,
+    bound_ns,
+    completions,
+    mean_age_ms,
+)
 from tests.reference.simulator import Result
-from tests.reference.test_against import Case, Played, make_case, play, reference
+from tests.reference.test_against import (
+    Case,
+    Played,
+    make_case,
+    play,
+    reference,
+    window_differences,
+)
 
 CASES = 12
 
@@ -44,7 +57,7 @@ def differences(case: Case, windows: object, result: Result) -> Iterator[str]:
             cycles = range(row["first_cycle"], row["first_cycle"] + width)
             ages = sorted(known[k] for k in cycles if k in known)
             l95 = ages[math.ceil(0.95 * len(ages)) - 1] / 1e6 if ages else math.inf
-            over = sum(age > chain.max_age_ms * 1e6 for age in ages)
+            over = sum(age > bound_ns(chain) for age in ages)
             missed = over / len(ages) if ages else 1.0
             found = row[f"age_l95_{name}"], row[f"age_missed_{name}"]
             if found != (l95, missed):
@@ -60,6 +73,8 @@ def test_ages_of_random_chains_equal_to_the_nanosecond(whole_ms: bool) -> None:
         chains += len(case.problem.pipeline.chains)
         found, result = play(case), reference(case)
         assert not list(differences(case, found.windows, result)), f"seed {seed}"
+        # V_D, too: cycles miss by the ages of their actuations.
+        assert not list(window_differences(case, found.windows, result, 0)), f"seed {seed}"
     assert chains > CASES
 
 

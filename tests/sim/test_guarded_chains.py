@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+from dwell.estimators.prices import prices_of
 from dwell.model import (
     Chain,
     Constant,
@@ -64,9 +65,29 @@ def test_a_dead_task_behind_a_sampled_flow_moves_the_cell_while_control_goes_on(
     assert found.windows["age_missed_see"].to_list()[8:] == [0.0] * 8
 
 
+def test_cycles_miss_while_their_detections_are_too_old() -> None:
+    # Control ends 2 ms after a release; 100 ms after the release at 150 it misses, until it gets
+    # the detection of the release at 300: it is there at 321, when the control of 320 starts.
+    found = play(cell(), down={"E": [(200, 2000)]}, windows=8)
+    missed = found.cycles.filter("missed")["cycle"].to_list()
+    assert missed == list(range(25, 32))
+    for column in ("violation_rate", "seen_violation_rate"):
+        assert found.windows[column].to_list() == [0, 0, 0, 0, 0, 1.0, 0.4, 0]
+
+
+def test_a_candidate_whose_detections_never_arrive_misses_all_in_its_price() -> None:
+    prices = prices_of(cell(), cycles=200)
+    assert {name: price.violation_rate for name, price in prices.items()} == {
+        "OFF": 0.0,
+        "ALT": 1.0,
+        "LOC": 0.0,
+    }
+
+
 def test_a_chain_without_a_bound_is_not_guarded() -> None:
     found = play(cell(math.inf), down={"E": [(200, 2000)]}, windows=16)
     assert moves(found) == []
+    assert not found.cycles["missed"].any()
 
 
 def test_a_fallback_on_which_only_the_chain_fails_is_left_after_the_patience() -> None:

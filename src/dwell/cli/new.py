@@ -18,15 +18,15 @@ from dwell.errors import ProblemError
 FOLDER = re.compile(r"\w[\w.+-]{0,62}")
 
 
-class Origin(StrEnum):
+class Template(StrEnum):
     """The example that a new cell begins as."""
 
     CANONICAL = "canonical"
     LIVE = "live"
 
 
-CELLS = {Origin.CANONICAL: "first.yaml", Origin.LIVE: "live/cell.yaml"}
-STAGES = {Origin.CANONICAL: "stages.py", Origin.LIVE: "live/stages.py"}
+CELLS = {Template.CANONICAL: "first.yaml", Template.LIVE: "live/cell.yaml"}
+STAGES = {Template.CANONICAL: "stages.py", Template.LIVE: "live/stages.py"}
 
 #: First lines of the cell file, after the line for editors.
 HEAD = """\
@@ -44,27 +44,27 @@ HEAD = """\
 # `dwell check cell.yaml` finds every fault; `python test_cell.py` simulates the cell.
 """
 MORE = {
-    Origin.CANONICAL: "# Execution times: `dwell profile --node R1 --task "
+    Template.CANONICAL: "# Execution times: `dwell profile --node R1 --task "
     "perception=stages:perceive --inputs stages:frame`\n# measures functions of stages.py here.",
-    Origin.LIVE: "#   tasks.*.run         functions and classes in stages.py\n"
+    Template.LIVE: "#   tasks.*.run         functions and classes in stages.py\n"
     "#   live.hosts          addresses of your computers",
 }
 #: Command that tries the policy.
 RUN = {
-    Origin.CANONICAL: "dwell run cell.yaml --windows 20",
-    Origin.LIVE: "dwell live run cell.yaml --seconds 20",
+    Template.CANONICAL: "dwell run cell.yaml --windows 20",
+    Template.LIVE: "dwell live run cell.yaml --seconds 20",
 }
 STAGES_HEAD = {
-    Origin.CANONICAL: '"""Stages to measure: replace them with yours."""\n',
-    Origin.LIVE: '"""Stages, and the drive that they steer: replace them with yours."""\n',
+    Template.CANONICAL: '"""Stages to measure: replace them with yours."""\n',
+    Template.LIVE: '"""Stages, and the drive that they steer: replace them with yours."""\n',
 }
 
 
 def new(
     folder: Annotated[Path, argument("NAME", "Folder to make.")],
     origin: Annotated[
-        Origin, typer.Option("--from", help="Example to start from: simulated or live.")
-    ] = Origin.CANONICAL,
+        Template, typer.Option("--from", help="Example to start from: simulated or live.")
+    ] = Template.CANONICAL,
 ) -> None:
     """Make a folder with a cell, a policy, stages and a test.
 
@@ -97,7 +97,7 @@ def new(
     )
 
 
-def _files(examples: Path, name: str, origin: Origin) -> dict[str, str]:
+def _files(examples: Path, name: str, origin: Template) -> dict[str, str]:
     """Return the texts of the files of a new cell by their names."""
     given = {
         file: (examples / place).read_text(encoding="utf-8")

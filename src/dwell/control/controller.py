@@ -11,6 +11,7 @@ from operator import add
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
@@ -83,6 +84,8 @@ class ClosedWindow:
         Makes the window's `Evidence` for estimators that learn.
     recent : ClosedWindow, optional
         The window's cycles since the last decision, for the estimator; None for the whole window.
+    over_age : bool array, shape (W,), optional
+        Whether the data of each cycle's actuation were older than a chain's `max_age_ms`.
     """
 
     latency_ns: Ints
@@ -93,6 +96,7 @@ class ClosedWindow:
     looked: LookedAt
     evidence: Callable[[], Evidence] | None = None
     recent: ClosedWindow | None = None
+    over_age: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:
         return f"<ClosedWindow of {len(self.latency_ns)} cycles>"
@@ -323,7 +327,7 @@ class Controller:
     def _metrics(self, window: ClosedWindow) -> tuple[float, float, float]:
         """Return L95 known at the end of the window (ms), V_D, and L95 for caps (ms)."""
         age_ns = window.close_ns - window.release_ns
-        missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns))
+        missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns, window.over_age))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
         return float(l95_ms), missed / len(age_ns), float(uncut_ms)
 

@@ -21,8 +21,10 @@ from dwell.model.problem import Problem
 NO_AGE = -1
 
 
-def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | int:
-    """Count the cycles that are later than D, or unfinished at the end of their window.
+def missed_cycles(
+    latency_ns: Ints, age_ns: Ints, deadline_ns: int, over_age: NDArray[np.bool_] | None = None
+) -> Ints | int:
+    """Count the cycles that are later than D, unfinished at the end of their window, or over age.
 
     Parameters
     ----------
@@ -32,12 +34,16 @@ def missed_cycles(latency_ns: Ints, age_ns: Ints, deadline_ns: int) -> Ints | in
         Time from each cycle's release to the end of its window.
     deadline_ns : int
         D.
+    over_age : bool array, shape (..., W), optional
+        Whether the data of each cycle's actuation were too old.
 
     Returns
     -------
     int, or int64 array of shape (...)
     """
     late = latency_ns > np.minimum(age_ns, deadline_ns)
+    if over_age is not None:
+        late = late | over_age
     # For one window, counting without an axis is several times faster.
     if late.ndim == 1:
         return int(np.count_nonzero(late))
@@ -110,11 +116,11 @@ def age_l95_ms(ages_ns: Ints) -> Floats:
     return l95
 
 
-def age_missed(ages_ns: Ints, max_age_ms: float) -> Floats:
+def age_missed(ages_ns: Ints, max_age_ns: int) -> Floats:
     """Return the share of each window's actuations with a larger age; 1 without actuations."""
     is_known = ages_ns != NO_AGE
     count = is_known.sum(axis=1)
-    over: NDArray[np.bool_] = is_known & (ages_ns > max_age_ms * 1e6)
+    over: NDArray[np.bool_] = is_known & (ages_ns > max_age_ns)
     share: Floats = np.where(count > 0, over.sum(axis=1) / np.maximum(count, 1), 1.0)
     return share
 

@@ -27,7 +27,9 @@ from dwell.estimators.candidate_player import (
 from dwell.estimators.remembered import Remembered
 from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
+from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import CycleOutcome
+from dwell.kernels.over_age import over_age
 from dwell.kernels.random_draws import Drawing
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
@@ -336,10 +338,17 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         l95_deviation_ms=_deviation(windows_ms, l95_error_ms),
         violation_deviation=_deviation(rates, violation_error),
         age=_age(player, name, windows, is_last=is_last) if problem.objective.weighs_age else None,
-        misses=None
-        if cap is None
-        else share_over(latency_ns[~is_idle] > problem.pipeline.deadline_ns, cap),
+        misses=None if cap is None else share_over(_missed(player, arrays, since)[~is_idle], cap),
     )
+
+
+def _missed(player: CandidatePlayer, arrays: Arrays, since: int) -> NDArray[np.bool_]:
+    """Return whether each cycle from `since` on is late, or its data are too old."""
+    ((problem, realisation),) = player.cells
+    late = arrays.tables.latency_ns[0, since:] > problem.pipeline.deadline_ns
+    played = problem.pipeline, realisation.release_ns, CellArrays(arrays)
+    missed: NDArray[np.bool_] = late | over_age(*played, slice(since, realisation.cycles))
+    return missed
 
 
 def _age(

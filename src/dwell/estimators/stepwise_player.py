@@ -19,8 +19,9 @@ from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED, prices_of
 from dwell.estimators.slow_processes import unseen_error
 from dwell.kernels.advance import play
-from dwell.kernels.arrays import Arrays
+from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import CycleOutcome
+from dwell.kernels.over_age import over_age
 from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
@@ -102,7 +103,7 @@ class StepwisePlayer:
         }
         self.cycles = 0
         self._misses = misses = problem.objective.caps.misses
-        self._deadline_ns = problem.pipeline.deadline_ns
+        self._pipeline = problem.pipeline
         #: Least number of steps with enough stretches for the cap on misses.
         self._least = 0
         if misses is not None:
@@ -184,7 +185,9 @@ class StepwisePlayer:
             cycles, tables = slice(first * self._window, twin.cursor), twin.arrays.tables
             latency_ns = tables.latency_ns[0, cycles].copy()
             due = tables.outcome[0, cycles] != CycleOutcome.IDLE
-            twin.add(means, ages_ms, latency_ns, latency_ns[due] > self._deadline_ns)
+            played = self._pipeline, self.declared.realisation.release_ns, CellArrays(twin.arrays)
+            missed = (latency_ns > self._pipeline.deadline_ns) | over_age(*played, cycles)
+            twin.add(means, ages_ms, latency_ns, missed[due])
         twin.price = None
         self.cycles += self._step * self._window
 

@@ -543,7 +543,11 @@ class _Layout:
             flow_row[flow.source, flow.target] for flow in pipeline.flows if flow.sampled
         ]
         self.rows["chains"] += [
-            {"source": names.index(chain.source), "target": names.index(chain.target)}
+            {
+                "source": names.index(chain.source),
+                "target": names.index(chain.target),
+                "max_age_ns": chain.max_age_ns,
+            }
             for chain in pipeline.chains.values()
         ]
         rates, needed_by = pipeline.rates, pipeline.sink_rates

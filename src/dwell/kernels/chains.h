@@ -45,4 +45,16 @@ void actuate(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   }
 }
 
+// Whether a chain's age at the actuation of a cycle, as known now, is over its bound.
+template <class S>
+bool is_over_age(const S& s, i64 cell, i64 cycle, i64 now) {
+  const Cell& of = s.cell(cell);
+  for (i64 number = 0; number < of.n_chains; ++number) {
+    const i64 row = s.actuation(cell, number, cycle), at_ns = s.actuated_ns[row];
+    const i64 max_age_ns = s.chains[of.chain_0 + number].max_age_ns;
+    if (at_ns <= now && at_ns - of.release_ns[s.actuated_from[row]] > max_age_ns) return true;
+  }
+  return false;
+}
+
 }  // namespace dwell

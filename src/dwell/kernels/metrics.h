@@ -3,6 +3,7 @@
 
 #include <limits>
 
+#include "chains.h"
 #include "windows.h"
 
 namespace dwell {
@@ -94,7 +95,8 @@ template <class S>
     const i64 latency_ns = s.latency_ns[row + i];
     const i64 age_ns = now - of.release_ns[first + i];
     unfinished += latency_ns > age_ns;
-    missed += latency_ns > std::min(age_ns, of.deadline_ns);
+    missed += latency_ns > std::min(age_ns, of.deadline_ns) ||
+              (S::kRates && is_over_age(s, cell, first + i, now));
     s.ages[S::kRates ? counted++ : i] = std::min(latency_ns, age_ns);
   }
   if (!S::kRates) counted = n;

@@ -107,7 +107,8 @@ template <class S>
 void lose_held(S& s, i64 cell, i64 cycle, i64 node) {
   if (!has_replicas(s, cell, cycle)) return;
   const Cell& of = s.cell(cell);
-  for (i64 flow = of.flow_copies; flow < 2 * of.flow_copies; ++flow) {
+  const i64 copies = of.flow_copies;
+  for (i64 flow = copies; flow < 2 * copies; ++flow) {
     const i64 sender = end_of(s, cell, cycle, s.flow(cell, flow).source);
     i64& attempts = attempts_of(s, cell, cycle, flow);
     if (attempts != kIsHeld || s.site(s.job(cell, cycle, sender)).node != node) continue;

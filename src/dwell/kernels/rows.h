@@ -89,8 +89,10 @@ struct Crossing;  // of meter.cpp
   field(i32, latency_chain) field(i32, weighs_age) /* whether `Seen` needs ages */               \
   field(i32, shadow) field(i32, parent)
 
-// A chain of tasks; `last` is the origin of its last actuation.
-#define DWELL_CHAIN(field) field(i64, source) field(i64, target) field(i64, last)
+// A chain of tasks; `last` is the origin of its last actuation. An older age than `max_age_ns` is a
+// miss.
+#define DWELL_CHAIN(field)                                                                       \
+  field(i64, source) field(i64, target) field(i64, last) field(i64, max_age_ns)
 
 // A task runs in every `every`-th cycle from 0 on. `n_in` counts its waited inputs. The rates of
 // the sinks to which waited flows lead from it, its own if it is a sink, are in `sink_rates`.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from dwell.errors import Fault
 from dwell.model.bounds import Bound
 from dwell.model.declaration import declared, key
+from dwell.model.instants import NEVER_NS
 from dwell.model.task_rates import Edge
 
 MAX_AGE_MS = Bound(0, above=True)
@@ -21,11 +22,21 @@ class Chain:
     source: str = key("Task from whose releases the age counts.", named="from")
     target: str = key("Task behind it, whose completions are the actuations.", named="to")
     max_age_ms: float = key(
-        "Age beyond which an actuation counts in `age_missed_<chain>`, ms.",
+        "Age at an actuation beyond which its cycle has missed, ms; the guard watches it, too.",
         MAX_AGE_MS,
         default=math.inf,
         usual="none",
     )
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether the chain has a bound on its age."""
+        return math.isfinite(self.max_age_ms)
+
+    @property
+    def max_age_ns(self) -> int:
+        """Bound on the age in whole nanoseconds, `NEVER_NS` for none."""
+        return min(round(self.max_age_ms * 1e6), NEVER_NS) if self.is_bounded else NEVER_NS
 
 
 class ChainPatience(NamedTuple):

@@ -375,9 +375,9 @@ class Problem(Displayed):
         pipeline, g = self.pipeline, self.controller.guard_cycles
         rates, found = pipeline.rates, dict[str, ChainPatience]()
         for name, chain in pipeline.chains.items():
-            if math.isfinite(chain.max_age_ms):
+            if chain.is_bounded:
                 interval_ns = pipeline.chain_cycles(chain) * pipeline.period_ns
-                patience_ns = round(chain.max_age_ms * 1e6) + (g - 1) * interval_ns
+                patience_ns = chain.max_age_ns + (g - 1) * interval_ns
                 found[name] = ChainPatience(patience_ns, rates[chain.source])
         return found
 

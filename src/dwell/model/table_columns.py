@@ -115,9 +115,9 @@ CYCLES = (
     Column(
         "missed",
         "Boolean",
-        "Later than D, or unfinished when its window closed, which is no earlier; or its "
-        "command was not applied. False where a live run's controller could not hear of it, "
-        "or after the last window of a simulated run.",
+        "Later than D, or unfinished when its window closed, which is no earlier; or its data "
+        "are over the `max_age_ms` of a chain; or its command was not applied. False where a live "
+        "run's controller could not hear of it, or after the last window of a simulated run.",
     ),
     Column("outcome", "outcome", "Its end."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),

@@ -13,6 +13,7 @@ from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, CellArrays, lay_out
 from dwell.kernels.codes import CycleOutcome
+from dwell.kernels.over_age import over_age
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
@@ -147,7 +148,9 @@ def _result(
         first, last = problem.warmup_windows, closed
         cycles = slice(first * width, last * width)
         is_due = tables.outcome[row, cycles] != CycleOutcome.IDLE
-        missed.append(tables.latency_ns[row, cycles][is_due] > problem.pipeline.deadline_ns)
+        late = tables.latency_ns[row, cycles] > problem.pipeline.deadline_ns
+        late |= over_age(problem.pipeline, cell.real.release_ns, CellArrays(arrays, row), cycles)
+        missed.append(late[is_due])
         if not used:
             shares = tables.shares[row, first:last, 0].mean(axis=0).tolist()
             resources = problem.fabric.resources.values()

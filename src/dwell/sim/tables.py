@@ -23,6 +23,7 @@ from dwell.control import (
 )
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CycleOutcome
+from dwell.kernels.over_age import over_age
 from dwell.kernels.realisation import Realisation
 from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
@@ -165,9 +166,10 @@ class PlayedRealisation:
 
     @cached_property
     def missed(self) -> NDArray[np.bool_]:
-        """Whether each cycle missed: later than D, or unfinished when its window closed."""
+        """Whether each cycle missed: late, unfinished when its window closed, or its data old."""
         latency_ns = self.arrays.tables.latency_ns[0, : self.released]
         missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
+        missed |= self._over_age
         if not self.realisation.is_cut(self.problem):
             # The windows of the last cycles never closed.
             missed[self.counted :] = False
@@ -181,6 +183,16 @@ class PlayedRealisation:
         if self.idle is not None:
             missed &= ~self.idle[: self.released]
         return missed
+
+    @property
+    def _over_age(self) -> NDArray[np.bool_]:
+        """Whether the data of each cycle's actuations were too old, as known at its close."""
+        close_ns = np.full(self.released, NEVER_NS - 1)
+        close_ns[self.first[:, None] + np.arange(self.problem.window_cycles)] = self.close_ns[
+            :, None
+        ]
+        played = self.problem.pipeline, self.realisation.release_ns, self.arrays
+        return over_age(*played, slice(self.released), close_ns)
 
 
 def make_tables(
@@ -307,7 +319,7 @@ def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np
     for number, (name, chain) in enumerate(played.problem.pipeline.chains.items()):
         ages_ns = cache(partial(_ages_ns, played, number))
         columns[f"age_l95_{name}"] = partial(_on_ages, ages_ns, age_l95_ms)
-        over = partial(age_missed, max_age_ms=chain.max_age_ms)
+        over = partial(age_missed, max_age_ns=chain.max_age_ns)
         columns[f"age_missed_{name}"] = partial(_on_ages, ages_ns, over)
     return columns
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dwell.kernels.arrays import CellArrays, flow_columns
 from dwell.kernels.codes import CycleOutcome
+from dwell.kernels.over_age import over_age
 from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 from dwell.model.number_arrays import Ints
@@ -29,6 +30,7 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     tables, pipeline = arrays.tables, problem.pipeline
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
     missed = tables.latency_ns[0, :last] > pipeline.deadline_ns
+    missed |= over_age(pipeline, real.release_ns, arrays, slice(last))
     missed &= tables.outcome[0, :last] != CycleOutcome.IDLE
     cycles = first + np.flatnonzero(missed[first:])
     logs, _, arrivals, _ = arrays.logs()

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dwell.control.windows import missed_cycles, seen_l95_ms
 from dwell.errors import SimulationError
@@ -38,6 +39,8 @@ class _Alone:
     Parameters
     ----------
     release_ns, latency_ns : int64 array, shape (cycles,)
+    over_age : bool array, shape (cycles,)
+        Whether each cycle has missed by the age of a chain, but not by its latency.
     first : int64 array, shape (windows,)
         First cycle of every window.
     used : dict of str to float64 array, shape (windows,)
@@ -50,6 +53,7 @@ class _Alone:
 
     release_ns: Ints
     latency_ns: Ints
+    over_age: NDArray[np.bool_]
     first: Ints
     used: dict[str, Floats]
     open_ns: Ints
@@ -145,6 +149,7 @@ class Hindsight:
         age_ns = close_ns - release_ns
         l95_ms, uncut_ms = seen_l95_ms(latency_ns, age_ns, self._censor_ms)
         missed = int(missed_cycles(latency_ns, age_ns, self._deadline_ns))
+        missed += int(np.count_nonzero(alone.over_age[first:end]))
         used = alone.utilisation(first, int(release_ns[0]), close_ns)
         return QoS(float(l95_ms), missed / len(release_ns), FrozenDict(used), float(uncut_ms))
 
@@ -163,4 +168,6 @@ def _alone(run: Run) -> _Alone:
     busy_ns = {
         name: np.concatenate(([0.0], np.cumsum(shares * span_ns))) for name, shares in used.items()
     }
-    return _Alone(release_ns, cycles["latency_ns"], first, used, open_ns, busy_ns)
+    latency_ns = cycles["latency_ns"]
+    over_age = cycles["missed"] & (latency_ns <= run.problem.pipeline.deadline_ns)
+    return _Alone(release_ns, latency_ns, over_age, first, used, open_ns, busy_ns)

@@ -105,6 +105,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         Whether all messages of this cycle or of the next are missing: its completion may be lost.
     row : int
         Row in the record; -1 until the cycle is recorded.
+    over_age : bool
+        Whether the data of an actuation in it were too old, as known at the end of its window.
     close_ns : int or None
         End of its window since the origin; None for a cycle outside windows.
     """
@@ -134,6 +136,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     deaf: bool = False
     row: int = -1
     window: int | None = None
+    over_age: bool = False
     close_ns: int | None = None
     outcome: str = ""
     shifts: dict[str, Shift] = {}
@@ -230,11 +233,12 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     def missed(self, deadline_ns: int) -> bool:
         """Whether it was later than D, unfinished at the end of its window, or not applied.
 
-        A command that the gate found stale counts as missed, even if its latency is below D.
+        A command that the gate found stale counts as missed, even if its latency is below D. So
+        does a command whose data are older than a chain permits.
         """
         if self.untold or self.idle:
             return False
-        if self.came_to(NOT_APPLIED, STALE):
+        if self.over_age or self.came_to(NOT_APPLIED, STALE):
             return True
         age_ns = NEVER_NS - 1 if self.close_ns is None else self.close_ns - self.at_ns
         return self.latency_ns > min(deadline_ns, age_ns)

@@ -7,6 +7,7 @@ task from which it descends. docs/background/simulator.md has the rules, under "
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import count
 
@@ -39,20 +40,38 @@ class DataAges:
             last = {name: self._ages(chain, cycles, 0)[1] for name, chain in self._chains.items()}
             self.known = {**self.known, **{name: at for name, at in last.items() if at}}
 
+    def judge(self, cycles: Sequence[LiveCycle], close_ns: int, known: Mapping[str, int]) -> None:
+        """Mark the cycles in which an actuation before the end of their window was over age."""
+        bounded = {n: one for n, one in self._chains.items() if math.isfinite(one.max_age_ms)}
+        for cycle in cycles if bounded else ():
+            cycle.over_age = False
+        for name, chain in bounded.items():
+            ages_ns, _ = self._ages(chain, cycles, known.get(name, 0), until_ns=close_ns)
+            for cycle, age_ns in zip(cycles, ages_ns.tolist(), strict=True):
+                cycle.over_age |= age_ns > chain.max_age_ms * 1e6
+
     def values(self, cycles: Sequence[LiveCycle], known: Mapping[str, int]) -> Values:
         """Return the columns of a window; `known` as it was before the window."""
         found: dict[str, object] = {}
         for name, chain in self._chains.items():
             ages_ns = self._ages(chain, cycles, known.get(name, 0))[0][None]
             found[f"age_l95_{name}"] = float(age_l95_ms(ages_ns)[0])
-            found[f"age_missed_{name}"] = float(age_missed(ages_ns, chain.max_age_ms)[0])
+            found[f"age_missed_{name}"] = float(age_missed(ages_ns, chain.max_age_ns)[0])
         return found
 
-    def _ages(self, chain: Chain, cycles: Sequence[LiveCycle], origin_ns: int) -> tuple[Ints, int]:
+    def _ages(
+        self,
+        chain: Chain,
+        cycles: Sequence[LiveCycle],
+        origin_ns: int,
+        until_ns: int = NEVER_NS,
+    ) -> tuple[Ints, int]:
         """Return the ages of a chain by cycle, `NO_AGE` without one, and the last origin."""
         ages_ns = np.full(len(cycles), NO_AGE, np.int64)
         actuated = [(*found, place) for place, found in self._actuations(chain, cycles)]
         for at_ns, origin, place in sorted(actuated, key=lambda one: (one[0], one[2])):
+            if at_ns > until_ns:
+                break
             origin_ns = origin_ns if origin is None else origin
             ages_ns[place] = max(at_ns - origin_ns, 0)
         return ages_ns, origin_ns

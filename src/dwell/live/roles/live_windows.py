@@ -472,7 +472,8 @@ class LiveWindows:
         row = self.record.next_row + end - 1 - self._window.at
         release_ns = np.array([cycle.at_ns for cycle in cycles], np.int64)
         shadows = sends_shadows(self._controller)
-        known = told(cycles)
+        known, ages = told(cycles), self.record.ages
+        ages.judge(cycles, close_ns, ages.known)
         return ClosedWindow(
             latency_ns=np.array([cycle.latency_ns for cycle in known], np.int64),
             release_ns=np.array([cycle.at_ns for cycle in known], np.int64),
@@ -481,6 +482,7 @@ class LiveWindows:
             core_ns=self._ledger.core_ns(cycles, close_ns),
             looked=LookedAt(window, row, end - begin),
             evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
+            over_age=np.array([cycle.over_age for cycle in known], np.bool_),
         )
 
     def _seen(

@@ -150,7 +150,8 @@ class RunRows:
     ) -> None:
         self._controller, self._ledger, self._processes = controller, ledger, processes
         problem = controller.problem
-        self._ages = DataAges(problem, ledger)
+        #: Data ages of the cell's chains.
+        self.ages = DataAges(problem, ledger)
         self._nodes, self._size = tuple(problem.fabric.nodes), problem.window_cycles
         self._warmup_windows, self._kept = problem.warmup_windows, kept
         self._deadline_ns = problem.pipeline.deadline_ns
@@ -184,8 +185,8 @@ class RunRows:
 
     def close(self, window: LiveWindow) -> None:
         """Record a window."""
-        window.known_origins = self._ages.known
-        self._ages.closed(window.cycles)
+        window.known_origins = self.ages.known
+        self.ages.closed(window.cycles)
         self._windows[window.number] = window
         self._changed_windows.add(window.number)
         if self._jobs:
@@ -207,6 +208,9 @@ class RunRows:
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
                 self._changed[row] = cycle
+        for number in self._changed_windows & self._windows.keys():
+            window = self._windows[number]
+            self.ages.judge(window.cycles, window.close_ns, window.known_origins)
         decided = (decision_values(self._controller, row) for row in self._controller.decisions)
         values: dict[str, Iterable[Values]] = {
             "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
@@ -286,7 +290,7 @@ class RunRows:
             "seen_violation_rate": seen_violation_rate,
             **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
             "cost": cost,
-            **self._ages.values(cycles, window.known_origins),
+            **self.ages.values(cycles, window.known_origins),
             "overtaken": sum(cycle.overtaken for cycle in cycles),
             "term": cycles[-1].term,
             "lead": window.lead,
