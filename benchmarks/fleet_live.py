@@ -170,7 +170,8 @@ class _Cell:
     def complete(self, stamp: Stamp, now_ns: int) -> None:
         """Say that a cycle has arrived."""
         at_ns, hops, before = stamp.released_ns, [], "stamper"
-        placed = {"sensing": "R1", **self.problem.candidates[stamp.placement], "control": "R2"}
+        candidate = self.problem.candidates[stamp.placement].first
+        placed = {"sensing": "R1", **candidate, "control": "R2"}
         for task, node in placed.items():
             hops.append(Hop(task, node, at_ns, at_ns, at_ns + 7_000_000, ((before, at_ns),)))
             at_ns, before = at_ns + 7_000_000, task

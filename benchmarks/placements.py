@@ -81,7 +81,7 @@ def schedulers(quick: bool) -> Section:
         sample = AnyPlacement(problem, "baseline", seed=0, windows=1)
         for name, found in json.loads(line).items():
             placement = Placement(found["nodes"])
-            J = cost(sample.measure(placement).qos, placement, placement, problem.objective)
+            J = cost(sample.measure(placement.first).qos, placement, placement, problem.objective)
             above[name].append(100 * (J / best - 1))
             took[name].append(1e3 * found["cpu_s"])
     figures = [Figure(name, values, "%") for name, values in above.items()]

@@ -37,6 +37,7 @@ SHAPES = {
     "a flow": cell_form.FLOW,
     "a chain": cell_form.CHAIN,
     "a search": cell_form.EVERY_PLACEMENT,
+    "replicas": cell_form.REPLICATED,
     "a disturbance": cell_form.DISTURBANCE,
     "the objective": cell_form.OBJECTIVE,
     "weights": cell_form.WEIGHTS,
@@ -99,6 +100,8 @@ def words(form: Form) -> str:
             return f"`{{{', '.join(form.names)}}}`"
         case cell_form.WordsForm(means, shape):
             return ", ".join([*(f"`{word}`" for word in means), words(shape)])
+        case cell_form.CandidateForm():
+            return "task → node, `{replicas, after_ms}`"
         case cell_form.ActuatorForm():
             return "text, `{ros2}`"
         case cell_form.CandidatesForm():

@@ -59,7 +59,7 @@ def test_hamming_by_hand(current: Placement, previous: Placement, share: float) 
 
 
 def test_hamming_does_not_depend_on_the_order_of_tasks() -> None:
-    assert hamming(LOC, Placement(reversed(list(LOC.items())))) == 0
+    assert hamming(LOC, Placement(reversed(list(LOC.first.items())))) == 0
 
 
 def test_hamming_names_the_tasks_that_differ() -> None:

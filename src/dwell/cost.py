@@ -94,7 +94,7 @@ class TierUtilisation(NamedTuple):
 
 
 def hamming(current: Placement, previous: Placement) -> float:
-    """Share of tasks that change node between two placements (paper, eq. 6).
+    """Share of tasks whose set of nodes changes between two placements (paper, eq. 6).
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ def hamming(current: Placement, previous: Placement) -> float:
             f"cannot compare placements of different tasks: {here} against {there}; "
             "place every task of the pipeline in both"
         )
-    return sum(previous[task] != node for task, node in current.items()) / len(current)
+    return len(current.moved(previous)) / len(current)
 
 
 def tier_nodes(objective: Objective) -> TierNodes:

@@ -149,7 +149,7 @@ def make_realisation(
 
 def _flow_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
     for flow in problem.pipeline.flows:
-        placements = problem.candidates.values()
+        placements = [copy for one in problem.candidates.values() for copy in one.copies]
         crossed = {f"{placed[flow.source]}->{placed[flow.target]}" for placed in placements}
         for link in problem.fabric.links:
             if link in crossed:
@@ -161,7 +161,7 @@ def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
     if problem.controller.migration == "warm":
         return
     for name, task in problem.pipeline.tasks.items():
-        nodes = {placement[name] for placement in problem.candidates.values()}
+        nodes = {copy[name] for one in problem.candidates.values() for copy in one.copies}
         for link in problem.fabric.links.values():
             if task.state_bytes and {link.source, link.target} <= nodes:
                 yield name, name, link.name

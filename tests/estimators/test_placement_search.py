@@ -41,18 +41,19 @@ def brute_force(problem: Problem, seed: int) -> list[Ranked]:
     sample = AnyPlacement(problem, "baseline", seed=seed, windows=CYCLES // problem.window_cycles)
     bounds, found = CostBounds(sample), []
     for placement in every_placement(problem):
-        qos = sample.measure(placement).qos
+        qos = sample.measure(placement.first).qos
         ranked = Ranked(placement, qos, cost(qos, placement, placement, problem.objective))
         partial, overloaded = bounds.root, False
         for name in bounds.order:
-            partial = bounds.placed(partial, placement[name])
+            partial = bounds.placed(partial, placement.first[name])
             overloaded |= bounds.overloaded(partial) is not None
             assert bounds.cost(partial) <= ranked.cost * (1 + 1e-9) + 1e-9
         if not overloaded:
             found.append(ranked)
     nodes = list(problem.fabric.nodes)
     return sorted(
-        found, key=lambda one: (one.cost, [nodes.index(one.placement[t]) for t in one.placement])
+        found,
+        key=lambda one: (one.cost, [nodes.index(node) for node in one.placement.first.values()]),
     )
 
 
@@ -105,7 +106,7 @@ def test_a_candidate_has_the_metrics_of_its_run() -> None:
     sample = AnyPlacement(problem, "baseline", seed=3, windows=windows)
     for name, placement in problem.candidates.items():
         run = dwell.simulate(problem, policy=name, seed=3, windows=windows).windows
-        measured = sample.measure(placement)
+        measured = sample.measure(placement.first)
         assert measured.l95_ms.tolist() == run["seen_l95_ms"].to_list()
         assert measured.violation_rate.tolist() == run["seen_violation_rate"].to_list()
         assert measured.utilisation["R1"] == pytest.approx(run["u_R1"].mean())
@@ -126,7 +127,7 @@ def test_the_best_placement_of_a_known_graph(
     best, second = ranking.best
     assert ranking.is_exact
     assert best.cost == best_ms
-    assert " ".join(best.placement[f"T{number}"] for number in range(1, 11)) == nodes
+    assert " ".join(best.placement.first[f"T{number}"] for number in range(1, 11)) == nodes
     assert second.cost > best.cost
     assert ranking.simulated < 0.02 * ranking.placements
 

@@ -234,7 +234,7 @@ def queue_free_ns(case: Case, placement: Placement) -> list[float]:
         return max(done(flow.source, cycle) + sent(flow, cycle) for flow in inputs)
 
     def done(task: str, cycle: int) -> float:
-        node = placement[task]
+        node = placement.first[task]
         ran = real.exec_ns[sites[task, node], cycle] * stretch(problem, task, node)
         return ready(task, cycle) + float(ran)
 

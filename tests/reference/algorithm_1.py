@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from dwell.model import Objective, QoS
 
-Nodes = Mapping[str, str]
+Nodes = Mapping[str, "str | tuple[str, str]"]
 
 
 @dataclass
@@ -29,7 +29,11 @@ class Row:
 
 def switching(now: Nodes, before: Nodes) -> float:
     """Equation 6."""
-    return len([v for v in now if now[v] != before[v]]) / len(now)
+
+    def nodes(of: str | tuple[str, str]) -> set[str]:
+        return {of} if isinstance(of, str) else set(of)
+
+    return len([v for v in now if nodes(now[v]) != nodes(before[v])]) / len(now)
 
 
 def price(q: QoS, now: Nodes, before: Nodes, objective: Objective) -> float:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from dwell.model import Flow, Pipeline, Placement
+from dwell.model import Flow, Pipeline
+from dwell.model.placement import Copy
 
 
 class Rates:
@@ -80,7 +81,7 @@ class Rates:
         found = [task for tasks in behind for task in tasks]
         return [start, *found] if found else []
 
-    def apart(self, active: Placement, other: Placement) -> set[str]:
+    def apart(self, active: Copy, other: Copy) -> set[str]:
         """Return the tasks that run on another node under `other`, or behind such a task."""
 
         def is_apart(task: str) -> bool:

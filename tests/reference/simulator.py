@@ -20,9 +20,11 @@ from typing import Any
 import simpy
 
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
-from dwell.model import Execution, Flow, Node, Placement, Problem, Quota, Task
+from dwell.model import Execution, Flow, Node, Problem, Quota, Task
+from dwell.model.placement import Copy
 from tests.reference.guard import NEVER, Guard, Proof, Wait
 from tests.reference.rates import Rates
+from tests.reference.replicas import Copies, second
 
 #: Of the changes of one instant, the place of what quotas do then.
 LAST_CHANGE = 900_000
@@ -163,7 +165,9 @@ class Result:
     `decisions` are those of the controller, and the moves of the guard. `looks` has one entry per
     instant at which a decision is due, whether or not the controller's node is up.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
-    with each other (see `closest_unrelated`); None where there is no such pair.
+    with each other (see `closest_unrelated`); None where there is no such pair. `late` counts the
+    messages of each cycle that came after the other copy's. Jobs of second copies have the name
+    `second(task)`, and so have both ends of their messages.
     """
 
     cycles: tuple[CycleResult, ...]
@@ -175,6 +179,7 @@ class Result:
     stamps: tuple[tuple[str, str | None], ...]
     decisions: tuple[Decision, ...]
     closest_ns: int | None
+    late: Mapping[int, int] = field(default_factory=dict)
 
     @property
     def busy(self) -> Mapping[str, tuple[Fraction, ...]]:
@@ -243,6 +248,7 @@ class Job:
     cores: int = 0
     due: int | None = None
     taken: dict[str, int] = field(default_factory=dict)
+    is_second: bool = False
 
     @property
     def readiness(self) -> tuple[int, int, int, int]:
@@ -303,6 +309,7 @@ class Message:
     is_state: bool = False
     migration: int = 0
     attempt: int = 0
+    is_stopped: Callable[[], bool] = lambda: False
     number: int = 0
     arrival: tuple[int, int] | None = None
 
@@ -782,8 +789,10 @@ class Simulation:
         self.release = [int(ns) for ns in real.release_ns]
         self.number = real.cycles
         self.end = self.close_of(self.number)
-        self.index = {task: i for i, task in enumerate(self.pipeline.tasks)}
+        rows = [*self.pipeline.tasks, *map(second, self.pipeline.tasks)]
+        self.index = {task: i for i, task in enumerate(rows)}
         self.rates = Rates(self.pipeline)
+        self.copies = Copies(problem)
 
         self.given = given
         self.script = list(script)
@@ -843,7 +852,7 @@ class Simulation:
             self.segments[segment.link].append(segment)
 
         # By cell and cycle, then by task.
-        self.placed: dict[tuple[int, int], Placement] = {}
+        self.placed: dict[tuple[int, int], Copy] = {}
         self.apart: dict[int, set[str]] = {}
         self.losses: dict[tuple[int, int], list[tuple[int, int, str]]] = {}
         # Cycles of which anything is lost, needed or not.
@@ -1035,6 +1044,7 @@ class Simulation:
             stamps=tuple(self.stamps),
             decisions=tuple(self.decisions),
             closest_ns=closest_unrelated(self.log),
+            late=self.copies.late,
         )
 
     def results(self, cell: int) -> dict[tuple[int, str], JobResult]:
@@ -1154,10 +1164,19 @@ class Simulation:
             delay = nanoseconds(self.settings.order_delay_ms)
             self.move(order, boundary, self.now + delay, begins_window=not self.between)
 
-    def apart_of(self, active: str, order: str) -> set[str]:
-        """Return the tasks that a move takes to another node."""
-        old, new = self.problem.candidates[active], self.problem.candidates[order]
-        return {task for task in self.pipeline.tasks if old[task] != new[task]}
+    def apart_of(self, active: str, order: str) -> dict[str, tuple[str, str, str]]:
+        """Return what a move brings to another node: task, old node of the first copy, new node.
+
+        The second new node of a task goes by the name of its second copy.
+        """
+        found: dict[str, tuple[str, str, str]] = {}
+        old, new = (self.copies.placements(name) for name in (active, order))
+        for task in self.pipeline.tasks:
+            here = [placed[task] for placed in old]
+            for node in dict.fromkeys(placed[task] for placed in new):
+                if node not in here:
+                    found[second(task) if task in found else task] = task, here[0], node
+        return found
 
     def next_order(self, active: str, boundary: int) -> str:
         """Return what the policy says, unless the guard holds it back."""
@@ -1213,41 +1232,41 @@ class Simulation:
         if self.first_stamped(boundary, arrival) + self.problem.window_cycles > self.number:
             self.over = True  # no window can follow, however fast the tasks move
             return
-        old, new = self.problem.candidates[active], self.problem.candidates[order]
         moving = self.apart_of(active, order)
         # No window closes, and nothing is decided, before the migration is over.
         self.first, self.moving = -1, True
         self.migration += 1
         number = self.migration
 
-        def be_ready(task: str) -> None:
-            moving.remove(task)
+        def be_ready(row: str) -> None:
+            del moving[row]
             if not moving:
                 self.move(order, boundary, self.now, begins_window=True)
 
         def arrive() -> None:
-            for task in moving:
+            for row, (task, _, _) in moving.items():
                 started = self.now + nanoseconds(self.pipeline.tasks[task].start_ms)
-                self.step(started, 0, task, number, lambda task=task: send_state(task))  # type: ignore[misc]
+                self.step(started, 0, row, number, lambda row=row: send_state(row))  # type: ignore[misc]
 
-        def send_state(task: str) -> None:
+        def send_state(row: str) -> None:
+            task, old, new = moving[row]
             payload = self.pipeline.tasks[task].state_bytes
             if payload == 0:
-                be_ready(task)
+                be_ready(row)
                 return
-            link = f"{old[task]}->{new[task]}"
+            link = f"{old}->{new}"
             self.send(
                 link,
                 Message(
                     ITSELF,
                     boundary,
-                    task,
+                    row,
                     payload,
                     self.draws(ITSELF, self.reals[ITSELF].hops.index((task, task, link))),
-                    lambda: be_ready(task),
+                    lambda: be_ready(row),
                     self.now,
                     self.current,
-                    self.index[task],
+                    self.index[row],
                     is_state=True,
                     migration=number,
                 ),
@@ -1313,7 +1332,7 @@ class Simulation:
 
     def is_there(self, candidate: str) -> bool:
         """Whether nothing of a candidate is missing."""
-        placement = self.problem.candidates[candidate]
+        placement = self.problem.candidates[candidate].first
         since = [self.node_down_since(node) for node in placement.values()]
         for name, task in self.pipeline.tasks.items():
             since.append(self.node_down_since(placement[name], nanoseconds(task.start_ms)))
@@ -1450,9 +1469,10 @@ class Simulation:
                 node.looked_at |= set(node.served)
             active, other = self.stamp(cycle)
             self.stamps.append((active, other))
-            self.placed[ITSELF, cycle] = self.problem.candidates[active]
+            self.placed[ITSELF, cycle] = self.problem.candidates[active].first
+            self.copies.release(cycle, active)
             if other is not None:
-                self.placed[SHADOW, cycle] = self.problem.candidates[other]
+                self.placed[SHADOW, cycle] = self.problem.candidates[other].first
                 self.apart[cycle] = self.rates.apart(
                     self.placed[ITSELF, cycle], self.placed[SHADOW, cycle]
                 )
@@ -1467,6 +1487,9 @@ class Simulation:
                     self.start_source(ITSELF, cycle, name)
                 else:
                     self.start_later(ITSELF, cycle, name, offset)
+                if self.copies.is_doubled(cycle, name):
+                    later = max(offset, self.copies.after_ns(cycle))
+                    self.start_later(ITSELF, cycle, second(name), later)
             if other is not None:
                 self.release_shadow(cycle)
 
@@ -1528,7 +1551,9 @@ class Simulation:
     def start_source(self, cell: int, cycle: int, task: str) -> None:
         # Reading: a source with an offset is released when its offset is over. On a node that is
         # down its job is lost as soon as it is ready.
-        if self.is_given_up(cell, cycle):
+        if self.is_given_up(cell, cycle) or self.copies.has_heard(
+            cycle, self.node_of(cell, cycle, task)
+        ):
             return
         job = self.make_job(cell, cycle, task, ())
         if self.nodes[job.node].down:
@@ -1618,20 +1643,33 @@ class Simulation:
 
     # ----------------------------------------------------------------------- inputs and workers
 
-    def deliver(self, cell: int, cycle: int, flow: Flow, sender: Job) -> None:
+    def node_of(self, cell: int, cycle: int, row: str) -> str:
+        """Return the node of a task, or of its second copy."""
+        if row in self.pipeline.tasks:
+            return self.placed[cell, cycle][row]
+        return self.copies.node_of_second(cycle, row)
+
+    def deliver(
+        self, cell: int, cycle: int, flow: Flow, sender: Job, *, is_second: bool = False
+    ) -> None:
         """Bring one input to a task, by a message or by a hand-over on the same node."""
-        task = flow.target
+        task, ends = flow.target, (flow.source, flow.target)
+        if is_second:
+            ends = second(flow.source), second(flow.target)
+            task = second(task) if self.copies.is_doubled(cycle, task) else task
         key = (cell, cycle, task)
         if self.is_given_up(cell, cycle):
             return
-        node = self.placed[cell, cycle][task]
+        node = self.node_of(cell, cycle, task)
         if self.nodes[node].down:
-            needed = not flow.sampled and self.rates.is_needed(task, cycle)
+            needed = not flow.sampled and self.rates.is_needed(flow.target, cycle)
             self.lose(cell, cycle, "node_down", is_needed=needed)
-            if not flow.sampled:
+            if not flow.sampled and not self.copies.is_common(cycle, task):
                 self.lost_joins.add(key)
             return
-        self.arrived[cell, cycle, flow.source, flow.target] = self.now
+        self.arrived[cell, cycle, *ends] = self.now
+        if self.copies.is_late(cycle, flow, task, node):
+            return
         if cell == SHADOW:
             self.hear_back(SHADOW, cycle)
         if flow.sampled:
@@ -1642,31 +1680,34 @@ class Simulation:
             return
         there = self.inputs.setdefault(key, [])
         there.append((self.now, sender))
-        if len(there) == len(self.rates.waited_inputs(task)):
+        if len(there) == len(self.rates.waited_inputs(flow.target)):
             del self.inputs[key]
             last = tuple(job for arrival, job in there if arrival == self.now)
             # A shadow stops before the sinks.
             if cell == ITSELF or task not in self.rates.sinks:
                 self.queue_up(self.make_job(cell, cycle, task, last))
 
-    def make_job(self, cell: int, cycle: int, name: str, senders: tuple[Job, ...]) -> Job:
+    def make_job(self, cell: int, cycle: int, row: str, senders: tuple[Job, ...]) -> Job:
         """Return the job that is ready now."""
+        is_second = row not in self.pipeline.tasks
+        name = self.copies.names[row] if is_second else row
         task = self.pipeline.tasks[name]
-        node = self.placed[cell, cycle][name]
+        node = self.node_of(cell, cycle, row)
         real = self.reals[cell]
         job = Job(
             cell=cell,
             cycle=cycle,
             task=task,
-            index=self.index[name],
+            index=self.index[row],
+            is_second=is_second,
             execution=task.on[node],
             node=node,
             ready=self.now,
             left=Fraction(int(real.exec_ns[real.sites.index((name, node)), cycle])),
             senders=senders,
         )
-        self.jobs[cell, cycle, name] = job
-        if cell == ITSELF:
+        self.jobs[cell, cycle, row] = job
+        if cell == ITSELF and not is_second:
             since, under = self.now - self.release[cycle], self.stamps[cycle][0]
             self.soonest[under, name] = min(since, self.soonest.get((under, name), since))
         return job
@@ -1698,13 +1739,20 @@ class Simulation:
         pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
+        if self.copies.has_heard(job.cycle, job.node):
+            return
         outputs = [
             flow
             for flow in self.pipeline.outputs(job.task.name)
             if self.rates.carries(flow, job.cycle)
         ]
         for flow in outputs:
-            self.send_output(job.cell, flow, job)
+            self.send_output(job.cell, flow, job, is_second=job.is_second)
+        if self.copies.is_common(job.cycle, job.task.name):
+            for flow in outputs:
+                if self.copies.is_doubled(job.cycle, flow.target):
+                    self.send_to_second(flow, job)
+        self.announce_done(job.cycle)
         if job.cell == ITSELF and (SHADOW, job.cycle) in self.placed:
             # Where the shadow shares the job, its outputs go to what it does not share, too.
             away = self.apart[job.cycle]
@@ -1717,14 +1765,55 @@ class Simulation:
         if job.cell == ITSELF and self.guard is not None:
             self.hear_actuation(job)
 
-    def send_output(self, cell: int, flow: Flow, job: Job) -> None:
+    def send_to_second(self, flow: Flow, job: Job) -> None:
+        """Send an output of a common task to the second copy of its target, or hold it."""
+        cycle, number = job.cycle, self.pipeline.flows.index(flow)
+        due = self.release[cycle] + self.copies.after_ns(cycle)
+        if self.now >= due:
+            self.send_output(ITSELF, flow, job, is_second=True)
+            return
+        self.copies.held[cycle, number] = job.node
+
+        def end() -> None:
+            held = self.copies.held.pop((cycle, number), None) is not None
+            if held and not self.copies.has_heard(cycle, job.node):
+                self.send_output(ITSELF, flow, job, is_second=True)
+
+        row = self.index[second(flow.target)]
+        self.at(due, REPEAT, cycle, row, end, flow=number, fixed=True)
+
+    def announce_done(self, cycle: int) -> None:
+        """Let the nodes of a cycle with two copies hear that it is done, once."""
+        if not self.copies.is_replicated(cycle) or cycle in self.copies.done:
+            return
+        jobs = [self.jobs.get((ITSELF, cycle, sink)) for sink in self.rates.sinks]
+        if any(job is None or job.outcome != "done" for job in jobs):
+            return
+        self.copies.done.add(cycle)
+        for number, node, way in self.copies.ways(cycle):
+
+            def hear(node: str = node) -> None:
+                self.copies.heard.add((cycle, node))
+                for (_, _, site), pool in self.pools.items():
+                    waiting = [job for job in pool.waiting if job.cycle == cycle]
+                    for job in waiting if site == node else ():
+                        pool.waiting.remove(job)
+
+            self.at(self.now + way, START, cycle, 2 * len(self.pipeline.tasks) + number, hear)
+
+    def send_output(self, cell: int, flow: Flow, job: Job, *, is_second: bool = False) -> None:
         """Hand an output over, or send it, to where a cell has its target."""
         cycle = job.cycle
         if self.is_given_up(cell, cycle):
             return
         target = self.placed[cell, cycle][flow.target]
+        row = flow.target
+        if is_second:
+            row = second(row)
+            if self.copies.is_doubled(cycle, flow.target):
+                target = self.copies.node_of_second(cycle, row)
         if target == job.node:
-            self.deliver(cell, cycle, flow, job)
+            self.deliver(cell, cycle, flow, job, is_second=is_second)
             return
         link = f"{job.node}->{target}"
         self.send(
@@ -1735,12 +1824,13 @@ class Simulation:
                 flow.target,
                 flow.payload_bytes,
                 self.draws(cell, self.reals[cell].hops.index((flow.source, flow.target, link))),
-                lambda: self.deliver(cell, cycle, flow, job),
+                lambda: self.deliver(cell, cycle, flow, job, is_second=is_second),
                 self.now,
                 self.current,
-                self.index[flow.target],
+                self.index[row],
                 flow=self.pipeline.flows.index(flow),
                 is_needed=not flow.sampled and self.rates.is_needed(flow.target, cycle),
+                is_stopped=lambda: self.copies.has_heard(cycle, job.node),
             ),
         )
 
@@ -1847,11 +1937,17 @@ class Simulation:
                 pool.restart += 1
                 pool.starting = True
         for cell, cycle, task in list(self.inputs):
-            if self.placed[cell, cycle][task] == name:
+            if self.node_of(cell, cycle, task) == name:
                 del self.inputs[cell, cycle, task]
-                self.lost_joins.add((cell, cycle, task))
-                needed = self.rates.is_needed(task, cycle)
+                if self.copies.is_common(cycle, task):
+                    self.copies.await_again(cycle, task)
+                else:
+                    self.lost_joins.add((cell, cycle, task))
+                needed = self.rates.is_needed(self.copies.names.get(task, task), cycle)
                 self.lose(cell, cycle, "node_down", is_needed=needed)
+        for cycle, number in [key for key, node in self.copies.held.items() if node == name]:
+            del self.copies.held[cycle, number]
+            self.lose(ITSELF, cycle, "node_down")
         self.values = {key: value for key, value in self.values.items() if key[1] != name}
 
     def come_up(self, name: str) -> None:
@@ -1990,7 +2086,8 @@ class Simulation:
         goes_on = self.going_on(message.migration)
 
         def happen() -> None:
-            if not goes_on() if message.is_state else self.is_given_up(message.cell, message.cycle):
+            over = message.is_stopped() or self.is_given_up(message.cell, message.cycle)
+            if not goes_on() if message.is_state else over:
                 # No other message waits for it from now on.
                 if message in self.ordered[link]:
                     message.arrival = self.now, self.current
@@ -2015,7 +2112,7 @@ class Simulation:
         )
 
 
-def way_back(problem: Problem, placement: Placement) -> int:
+def way_back(problem: Problem, placement: Copy) -> int:
     """Return the least sum of mean delays from the farthest sink's node to the stamper's."""
     tasks = problem.pipeline.tasks
     sinks = [placement[task] for task in tasks if not problem.pipeline.outputs(task)]

@@ -51,12 +51,14 @@ from tests.cells.generated import (
     random_stamps,
 )
 from tests.cells.rated import with_chains, with_rates
+from tests.cells.replicated import with_replicas
 from tests.kernels.parts import attempt_uniform as kernel_uniform
 from tests.reference import guard as reference_guard
 from tests.reference import simulator as reference_simulator
 from tests.reference.algorithm_1 import price, switching
 from tests.reference.chains import over_age
 from tests.reference.rates import Rates
+from tests.reference.replicas import second
 from tests.reference.simulator import (
     ITSELF,
     NEAR_NS,
@@ -208,6 +210,7 @@ def make_case(
     orders: bool = False,
     in_order: bool = False,
     rates: bool = False,
+    replicas: bool = False,
 ) -> Case:
     rng = Random(seed)
     problem = random_problem(rng, schedulers=schedulers, whole_ms=whole_ms, orders=orders)
@@ -215,11 +218,15 @@ def make_case(
         problem = with_order(problem, Random(seed), whole_ms=whole_ms)
     if rates:
         problem = with_rates(problem, Random(f"{seed} rates"))
-    problem = with_deadline(problem, Random(f"{seed} deadline"), whole_ms=whole_ms)
+    if replicas:
+        problem = with_replicas(problem, Random(f"{seed} replicas"), whole_ms=whole_ms)
+    else:
+        problem = with_deadline(problem, Random(f"{seed} deadline"), whole_ms=whole_ms)
     windows = rng.randint(3, 10) if orders else rng.randint(2, 8)
     names = tuple(random_stamps(rng, problem, windows))
     real = dwell.draw(problem, scenario="disturbed", seed=seed, windows=windows)
     share = rng.choice([0.0, 0.1, 0.3, 1.0]) / len(problem.candidates) if orders else 0.0
+    share = 0.0 if replicas else share
     fractions: dict[str, float] = {}
     if share:
         # Of the largest share, none to all under each candidate.
@@ -434,7 +441,11 @@ def is_split(parts: Sequence[int | None], expected: CycleResult, tolerance_ns: i
 
 def job_differences(jobs: pl.DataFrame, result: Result, tolerance_ns: int) -> Iterator[str]:
     rows = {
-        (row.get("shadow", False), row["cycle"], row["task"]): row
+        (
+            row.get("shadow", False),
+            row["cycle"],
+            second(row["task"]) if row.get("second") else row["task"],
+        ): row
         for row in jobs.iter_rows(named=True)
     }
     assert len(rows) == len(jobs)
@@ -513,6 +524,9 @@ def window_differences(
             yield f"{where}: {row['placement']}, mixed {row['mixed']}, expected {placed}"
         if row["cost"] is not None:
             yield from cost_differences(case, row, expected, result, tolerance_ns)
+        late = sum(result.late.get(k, 0) for k in range(first, last))
+        if row.get("late_copies", late) != late:
+            yield f"{where}: late_copies {row['late_copies']}, expected {late}"
         sent = sum(other is not None for _, other in result.stamps[first:last])
         if row.get("shadow_cycles", 0) != sent:
             yield f"{where}: shadow_cycles {row['shadow_cycles']}, expected {sent}"
@@ -845,17 +859,19 @@ def compare(
     jitter: bool = False,
     in_order: bool = False,
     rates: bool = False,
+    replicas: bool = False,
 ) -> None:
     excluded = 0
     failures: list[str] = []
-    examples = -(-LONGER // 2) if guarded else LONGER if orders else EXAMPLES
+    examples = -(-LONGER // 2) if guarded else LONGER if orders or replicas else EXAMPLES
     few = -(-examples // ONE_IN)
     seeds = range(few) if part == "few" else range(few, examples)
     for seed in seeds:
         make = make_guarded if guarded else make_case
-        case = make(
-            *(seed, schedulers), whole_ms=whole_ms, orders=orders, in_order=in_order, rates=rates
-        )
+        how = {"whole_ms": whole_ms, "orders": orders, "in_order": in_order, "rates": rates}
+        case = make(seed, schedulers, **how, **({"replicas": True} if replicas else {}))
+        if replicas and not case.problem.replicas:
+            continue
         if rates and not case.problem.pipeline.has_rates:
             continue
         if jitter:
@@ -866,10 +882,16 @@ def compare(
         if found is None:
             excluded += 1
         elif found:
-            how = f"whole_ms={whole_ms}, orders={orders}, in_order={in_order}, rates={rates}"
             failures.append(f"{make.__name__}({seed}, {schedulers}, {how}): {found[:3]}")
     assert not failures, f"{len(failures)} of {len(seeds)} differ:\n" + "\n".join(failures[:10])
     assert excluded <= math.ceil(MOST_EXCLUDED * len(seeds))
+
+
+@pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])
+@pytest.mark.parametrize("in_order", [False, True], ids=["free", "in-order"])
+def test_replicas_equal_to_the_nanosecond(part: str, in_order: bool, whole_ms: bool) -> None:
+    how = {"whole_ms": whole_ms, "in_order": in_order, "replicas": True}
+    compare(part, ("fifo", "priority"), **how, orders=whole_ms is in_order)
 
 
 @pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])

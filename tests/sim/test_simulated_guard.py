@@ -163,7 +163,7 @@ def test_it_hears_of_completions_after_the_way_back() -> None:
         window_cycles=4,
         controller=replace(problem.controller, fallbacks=("ALT",)),
     )
-    assert {back_ns(far, placement) for placement in far.candidates.values()} == {MS}
+    assert {back_ns(far, placement.first) for placement in far.candidates.values()} == {MS}
     # 1 + 1 + 26 + 1 ms, and a way back of 1 ms.
     on_time = {("act", "E"): [1.0, 26.0, *[1.0] * 30]}
     assert moves(play(far, exec_ms=on_time)) == []
@@ -183,8 +183,8 @@ def test_the_way_back_is_the_shortest_and_nothing_where_there_is_none() -> None:
     ]
     for some, expected_ms in ((links, 7.5), (links[:2], 9.0), (links[:1], 0.0)):
         problem = make_problem(nodes, chain, [Flow("a", "b")], links=some)
-        assert back_ns(problem, problem.candidates["LOC"]) == expected_ms * MS
-        assert way_back(problem, problem.candidates["LOC"]) == expected_ms * MS
+        assert back_ns(problem, problem.candidates["LOC"].first) == expected_ms * MS
+        assert way_back(problem, problem.candidates["LOC"].first) == expected_ms * MS
 
 
 def test_single_losses_are_no_reason_while_others_come_in_time() -> None:

@@ -30,6 +30,7 @@ from dwell.model import (
     Placement,
     Problem,
     Process,
+    Replicas,
     Servo,
     Targets,
     Task,
@@ -41,6 +42,7 @@ from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
 from dwell.model.process import DRAWN, UnreadTrace
+from dwell.model.replicated import Replicated
 from dwell.model.semantics import (
     CellParts,
     UnreadNames,
@@ -109,7 +111,7 @@ class Assembly:
         controller, servo = self._section("controller", ControllerSettings), self._servo()
         live, scenarios = self._live(timing), self._scenarios()
         named, every = entry.candidates.named, self._made(entry.candidates.every)
-        candidates = _without_none(named)
+        candidates, replicated = self._candidates(named)
         called = name if entry.name is None else entry.name
         parts = CellParts(
             nodes=nodes,
@@ -120,6 +122,7 @@ class Assembly:
             scales=dict(entry.scales or {}),
             chains=timing.chains if timing is not None else {},
             candidates=candidates,
+            replicated=replicated,
             broken_candidates=[name for name, moves in named.items() if moves is None],
             every_placement=every,
             scenarios=scenarios,
@@ -150,7 +153,7 @@ class Assembly:
             name=called,
             pipeline=pipeline,
             fabric=fabric,
-            candidates={name: _complete(moves, whole) for name, moves in candidates.items()},
+            candidates=_placements(named, candidates, replicated, whole),
             objective=objective,
             scenarios={name: tuple(item for _, item in items) for name, items in scenarios.items()},
             controller=controller,
@@ -307,6 +310,22 @@ class Assembly:
             latency=entry.latency,
         )
 
+    def _candidates(
+        self, named: Mapping[str, Any]
+    ) -> tuple[dict[str, dict[str, str]], dict[str, Replicated]]:
+        """Return the readable candidates: plain placements, and replicas."""
+        plain: dict[str, dict[str, str]] = {}
+        replicated: dict[str, Replicated] = {}
+        for name, moves in named.items():
+            if isinstance(moves, Entry):
+                made = self.faults.attempt(
+                    moves.path, Replicated, **{**moves.values, "replicas": tuple(moves.replicas)}
+                )
+                replicated |= {name: made} if made is not None else {}
+            elif moves is not None:
+                plain[name] = moves
+        return plain, replicated
+
     def _servo(self) -> Servo | None:
         servo: Servo | None = self._made(self.entry.servo)
         if servo is not None and not self.faults.at("period_ms"):
@@ -393,3 +412,18 @@ def _forward(
 def _complete(moves: Mapping[str, str], tasks: Mapping[str, Task]) -> Placement:
     """Return the placement of every task: an anchored one follows its anchor."""
     return Placement((name, moves.get(name) or next(iter(task.on))) for name, task in tasks.items())
+
+
+def _placements(
+    names: Iterable[str],
+    plain: Mapping[str, Mapping[str, str]],
+    replicated: Mapping[str, Replicated],
+    tasks: Mapping[str, Task],
+) -> dict[str, Placement]:
+    """Return the placements of all candidates, in the order of the file."""
+    placed = {name: _complete(moves, tasks) for name, moves in plain.items()}
+    both = {
+        name: Replicas({member: placed[member] for member in one.replicas}, one.after_ms)
+        for name, one in replicated.items()
+    }
+    return {name: both[name] if name in both else placed[name] for name in names}

@@ -69,6 +69,7 @@ from dwell.model.every_placement import KEEP, RESERVED, EveryPlacement
 from dwell.model.frozen import FrozenDict
 from dwell.model.pipeline import WORKERS
 from dwell.model.process import DRAWN
+from dwell.model.replicated import Replicated
 from dwell.model.ros_topics import RosActuator, RosCommands, RosTopic
 from dwell.policies.registry import REGISTRY as POLICIES
 
@@ -386,6 +387,25 @@ TASK = shape_of(
     ),
 )
 FLOW, CHAIN = shape_of(Flow, {}), shape_of(Chain, {})
+REPLICATED = shape_of(Replicated, {})
+PLACED = MappingForm(NAME)
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateForm(Form):
+    """A placement: relocatable task to node; or `{replicas}`, two other candidates."""
+
+    def read(self, value: Any, path: str, faults: Faults) -> Any:
+        """Return a dict of nodes by task, or the entry of replicas."""
+        # A task may have the name `replicas`.
+        if isinstance(value, dict) and isinstance(value.get("replicas"), list):
+            return REPLICATED.read(value, path, faults)
+        return PLACED.read(value, path, faults)
+
+    def schema(self, definitions: Definitions) -> JsonSchema:
+        """Return the schemas of both."""
+        return {"anyOf": [PLACED.schema(definitions), REPLICATED.schema(definitions)]}
+
 
 # ------------------------------------------------------------- scenarios, objective, control
 
@@ -476,7 +496,7 @@ EVERY_PLACEMENT = shape_of(
         "keep": WrittenForm("2 to 8", _keep, shown=NumberForm(KEEP).schema({})),
     },
 )
-NAMED = MappingForm(MappingForm(NAME), keeps=True, least=1)
+NAMED = MappingForm(CandidateForm(), keeps=True, least=1)
 
 
 @dataclass(frozen=True, eq=False)

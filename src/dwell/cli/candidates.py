@@ -74,7 +74,7 @@ def _named(problem: Problem, best: Sequence[Ranked]) -> Iterator[tuple[str, Plac
 
 def _movable(problem: Problem, placement: Placement) -> Mapping[str, str]:
     tasks = problem.pipeline.tasks
-    return {task: node for task, node in placement.items() if not tasks[task].anchored}
+    return {task: node for task, node in placement.first.items() if not tasks[task].anchored}
 
 
 def _contents(

@@ -490,13 +490,13 @@ def parts_of(problem: Problem, candidate: str) -> frozenset[str]:
 
     Nodes have their name; links have the form ``R1->E``, workers ``perception@E``.
     """
-    pipeline, placement = problem.pipeline, problem.candidates[candidate]
-    crossed = {(placement[flow.source], placement[flow.target]) for flow in pipeline.flows}
+    pipeline, copies = problem.pipeline, problem.candidates[candidate].copies
+    crossed = {(one[flow.source], one[flow.target]) for one in copies for flow in pipeline.flows}
     return frozenset(
         {
-            *placement.values(),
+            *(node for placement in copies for node in placement.values()),
             *(f"{source}->{target}" for source, target in crossed if source != target),
-            *(f"{task}@{node}" for task, node in placement.items()),
+            *(f"{task}@{node}" for placement in copies for task, node in placement.items()),
         }
     )
 

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dwell.control.controller import Controller
-from dwell.cost import GAIN_TOLERANCE, tier_nodes
+from dwell.cost import GAIN_TOLERANCE, hamming, tier_nodes
 from dwell.estimators import Profile
 from dwell.model import Objective
 from dwell.model.number_arrays import Floats
@@ -62,7 +62,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
         return None
     if own.objective not in (None, problem.objective) or problem.objective.beyond_cycles:
         return None
-    names, nodes = list(problem.candidates), list(problem.fabric.nodes)
+    names, placed = list(problem.candidates), list(own.candidates.values())
     resources = list(problem.fabric.resources)
     known = {
         "l95_ms": profile.l95_ms,
@@ -70,7 +70,6 @@ def plain_rule(controller: Controller) -> PlainRule | None:
         "violation_rate": profile.violation_rate,
         "on_robot": _on_robot(own) if isinstance(own, ATP) else dict.fromkeys(names, 0.0),
     }
-    on = np.array([[nodes.index(node) for node in one.values()] for one in own.candidates.values()])
     tier_of = {
         name: tier
         for tier, members in tier_nodes(problem.objective)._asdict().items()
@@ -89,7 +88,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
         },
         options={name: np.array([by[one] for one in names]) for name, by in known.items()},
         work=np.array([[profile.own[name][one] for one in resources] for name in names]),
-        switching=(on[:, None] != on).sum(axis=2) / on.shape[1],
+        switching=np.array([[hamming(b, a) for b in placed] for a in placed]),
         tiers=tuple(tier_of.get(one, "") for one in resources),
     )
 
@@ -142,7 +141,7 @@ def _of_atp(policy: ATP, names: list[str]) -> dict[str, float]:
 def _on_robot(policy: ATP) -> dict[str, float]:
     tiers, task = policy.objective.tiers, policy.pair.task
     return {
-        name: float(tiers.get(placement[task]) == "robot")
+        name: float(tiers.get(placement.first[task]) == "robot")
         for name, placement in policy.candidates.items()
     }
 

@@ -144,7 +144,9 @@ class CellMetrics(Collector):
     def _samples(self) -> dict[str, Samples]:
         now, problem = self._observer.now(), self._problem
         health, placement = now.status["health"], now.placement
-        placed: Mapping[str, str] = problem.candidates.get(placement, {})
+        placed: Mapping[str, str] = (
+            problem.candidates[placement].first if placement in problem.candidates else {}
+        )
         # Ignore the old status if the controller does not answer.
         status: Mapping[str, Any] = {} if health == "absent" else now.status
         window, moves, processes, stages, flows = (

@@ -23,7 +23,7 @@ from dwell.estimators.slow_processes import processes_of
 from dwell.model.fabric import Link, Node
 from dwell.model.objective import TIERS, Objective
 from dwell.model.pipeline import Execution, Flow, Task
-from dwell.model.placement import Placement
+from dwell.model.placement import Copy
 from dwell.model.problem import Problem
 from dwell.model.process import Process, Trace
 from dwell.model.scenario import LinkDisturbance, NodeDisturbance, acts
@@ -45,11 +45,13 @@ def warnings_of(problem: Problem) -> Iterator[Fault]:
     """Yield a warning for each setting of a cell that is valid but seldom intended."""
     profile = Profile(problem)
     for name, placement in problem.candidates.items():
+        over = _over_caps(problem, placement.first, profile.uncut_l95_ms[name])
+        members = placement.copies if placement.second is None else ()
         messages = chain(
-            _overloads(problem, placement),
-            _slow_stages(problem, placement),
-            _full_links(problem, placement),
-            _over_caps(problem, placement, profile.uncut_l95_ms[name]),
+            *(_overloads(problem, copy) for copy in members),
+            *(_slow_stages(problem, copy) for copy in members),
+            *(_full_links(problem, copy) for copy in members),
+            over,
         )
         yield from (Fault(f"candidates.{name}", message) for message in messages)
     yield from _unused_priorities(problem)
@@ -103,7 +105,7 @@ def unpriced(problem: Problem, scenario: str, cycles: int) -> Iterator[Fault]:
 # ------------------------------------------------------------------------------- keeping pace
 
 
-def _overloads(problem: Problem, placement: Placement) -> Iterator[str]:
+def _overloads(problem: Problem, placement: Copy) -> Iterator[str]:
     """Yield nodes that own work overloads, and accelerators that it nearly fills."""
     for name, share in _own_shares(problem, placement).items():
         resource = problem.fabric.resources[name]
@@ -137,14 +139,14 @@ def _limit_and_remedy(node: Node, left: float) -> tuple[str, str]:
     return f"{limit}, of which {' and '.join(filter(takers.get, takers))} leave {left:.0%}", ""
 
 
-def _on_cpu(problem: Problem, node: Node, placement: Placement) -> list[tuple[Task, Execution]]:
+def _on_cpu(problem: Problem, node: Node, placement: Copy) -> list[tuple[Task, Execution]]:
     """Return the tasks that a placement has on the cores of a node."""
     tasks = [task for task in problem.pipeline.tasks.values() if placement[task.name] == node.name]
     both = [(task, task.on[node.name]) for task in tasks]
     return [(task, execution) for task, execution in both if execution.accelerator is None]
 
 
-def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
+def _own_shares(problem: Problem, placement: Copy) -> dict[str, float]:
     """Return the share of each resource's capacity that own work needs."""
     work_ms, rates = dict.fromkeys(problem.fabric.resources, 0.0), problem.pipeline.rates
     for task in problem.pipeline.tasks.values():
@@ -159,7 +161,7 @@ def _own_shares(problem: Problem, placement: Placement) -> dict[str, float]:
     }
 
 
-def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
+def _left_share(problem: Problem, node: Node, placement: Copy) -> float:
     """Return the largest share of a node's capacity that background and bursts leave free."""
     left, bursts = 1 - node.background / node.capacity, node.bursts
     if bursts is None or bursts.threads == 0:
@@ -173,7 +175,7 @@ def _left_share(problem: Problem, node: Node, placement: Placement) -> float:
     return left * (1 - bursts.share * (1 - beside / node.interference))
 
 
-def _slow_stages(problem: Problem, placement: Placement) -> Iterator[str]:
+def _slow_stages(problem: Problem, placement: Copy) -> Iterator[str]:
     """Yield tasks with too few workers for the time of their jobs."""
     shares, rates = _own_shares(problem, placement), problem.pipeline.rates
     for task in problem.pipeline.tasks.values():
@@ -199,7 +201,7 @@ class _Jobs(NamedTuple):
     ms: float
 
 
-def _wide_jobs(problem: Problem, placement: Placement, node: Node, left: float) -> Iterator[str]:
+def _wide_jobs(problem: Problem, placement: Copy, node: Node, left: float) -> Iterator[str]:
     """Yield a warning if jobs take more than a period because they cannot all run at once."""
     period_ms, jobs, alone_ms = problem.pipeline.period_ms, {}, 0.0
     rates = problem.pipeline.rates
@@ -262,7 +264,7 @@ def _unused_priorities(problem: Problem) -> Iterator[Fault]:
     for task in tasks:
         shared = {
             _resource(task, placement): other.name
-            for placement in problem.candidates.values()
+            for placement in _copies(problem)
             for other in tasks
             if other.priority != task.priority
             and _resource(other, placement) == _resource(task, placement)
@@ -276,12 +278,18 @@ def _unused_priorities(problem: Problem) -> Iterator[Fault]:
             )
 
 
-def _resource(task: Task, placement: Placement) -> str:
+def _copies(problem: Problem) -> Iterator[Copy]:
+    """Yield the placements of all candidates without replicas."""
+    for placement in problem.plain_candidates.values():
+        yield placement.first
+
+
+def _resource(task: Task, placement: Copy) -> str:
     node = placement[task.name]
     return task.on[node].resource(node)
 
 
-def _crossings(problem: Problem, placement: Placement) -> Iterator[tuple[Flow, Link]]:
+def _crossings(problem: Problem, placement: Copy) -> Iterator[tuple[Flow, Link]]:
     """Yield the flows of a placement that cross a link, with the link."""
     for flow in problem.pipeline.flows:
         name = f"{placement[flow.source]}->{placement[flow.target]}"
@@ -289,7 +297,7 @@ def _crossings(problem: Problem, placement: Placement) -> Iterator[tuple[Flow, L
             yield flow, problem.fabric.links[name]
 
 
-def _full_links(problem: Problem, placement: Placement) -> Iterator[str]:
+def _full_links(problem: Problem, placement: Copy) -> Iterator[str]:
     """Yield links that get more data than their rate allows, including repeated messages."""
     sent_bytes = dict.fromkeys(problem.fabric.links, 0.0)
     for flow, link in _crossings(problem, placement):
@@ -328,7 +336,7 @@ def _same_placements(problem: Problem) -> Iterator[Fault]:
             )
 
 
-def _over_caps(problem: Problem, placement: Placement, l95_ms: float) -> Iterator[str]:
+def _over_caps(problem: Problem, placement: Copy, l95_ms: float) -> Iterator[str]:
     """Yield the caps that a candidate exceeds without disturbances."""
     caps = problem.objective.caps
     never = "it is never eligible while another one is"
@@ -434,7 +442,7 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
 
 def _return_ms(problem: Problem, candidate: str) -> float:
     """Return the longest mean delay of the links from a sink's node to a source's node, ms."""
-    pipeline, placement = problem.pipeline, problem.candidates[candidate]
+    pipeline, placement = problem.pipeline, problem.candidates[candidate].first
     sources = [placement[task] for task in pipeline.tasks if not pipeline.inputs(task)]
     sinks = [placement[task] for task in pipeline.tasks if not pipeline.outputs(task)]
     names = [f"{sink}->{source}" for sink in sinks for source in sources]
@@ -448,9 +456,11 @@ def _helpless_fallbacks(problem: Problem) -> Iterator[Fault]:
     if not fallbacks:
         return
     anchors = {next(iter(task.on)) for task in problem.pipeline.tasks.values() if task.anchored}
-    needed = [set(problem.candidates[name].values()) for name in fallbacks]
+    needed = [set(problem.candidates[name].first.values()) for name in fallbacks]
     for name in set.intersection(*needed) - anchors - set(problem.fabric.tier("robot")):
-        others = [c for c, placed in problem.candidates.items() if name not in placed.values()]
+        others = [
+            c for c, placed in problem.plain_candidates.items() if name not in placed.values()
+        ]
         remedy = f"add {others[0]}" if others else "declare a candidate without it, and add that"
         yield Fault(
             "controller.fallbacks",
@@ -538,7 +548,7 @@ def _stale_commands(problem: Problem) -> Iterator[Fault]:
     pipeline, age_ms = problem.pipeline, problem.live.max_age_ms
     if age_ms is None:
         return
-    for candidate, placement in problem.candidates.items():
+    for candidate, placement in ((c, p.first) for c, p in problem.plain_candidates.items()):
         links = dict(_crossings(problem, placement))
         sent_ms = [
             _shortest(links[flow].delay_ms) if flow in links else 0.0 for flow in pipeline.flows

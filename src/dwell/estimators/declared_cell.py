@@ -17,7 +17,7 @@ from dwell.estimators.remembered import Remembered
 from dwell.estimators.sent_shadows import SentShadows
 from dwell.estimators.slow_processes import slow_processes
 from dwell.kernels.advance import LoggedCycles
-from dwell.kernels.arrays import CellArrays, flow_rows
+from dwell.kernels.arrays import CellArrays, flow_columns
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model.frozen import FrozenDict
@@ -129,6 +129,6 @@ def _shown(
 def _evidence_of(player: CandidatePlayer, name: str) -> Evidence:
     """Return the evidence of all cycles on a candidate."""
     problem, real = player.cells[0]
-    logged = LoggedCycles(CellArrays(player.play({0: name})), flow_rows(problem.pipeline))
+    logged = LoggedCycles(CellArrays(player.play({0: name})), flow_columns(problem))
     rows = logged.window(0, real.cycles)
     return Evidence(int(real.release_ns[-1]), real.release_ns[:-1], rows)

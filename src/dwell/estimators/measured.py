@@ -18,7 +18,7 @@ from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
 from dwell.model.fabric import Node
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.pipeline import Execution, Pipeline
-from dwell.model.placement import Placement
+from dwell.model.placement import Copy, Placement, Replicas
 from dwell.model.problem import Problem
 
 Rows: TypeAlias = slice | Ints
@@ -46,20 +46,61 @@ class Message(NamedTuple):
 Part: TypeAlias = Site | Message
 
 
-def message_of(source: str, target: str, placement: Placement) -> Message | None:
+def message_of(source: str, target: str, placement: Copy) -> Message | None:
     """Return the message of a flow under a placement; None if both tasks are on one node."""
     here, there = placement[source], placement[target]
     return Message(source, target, f"{here}->{there}") if here != there else None
 
 
 def parts_of(pipeline: Pipeline, placement: Placement) -> Iterator[Part]:
-    """Yield the parts of a cycle under a placement."""
+    """Yield the parts of a cycle under a placement, of both copies if it has replicas."""
+    yield from dict.fromkeys(
+        part for copy in placement.copies for part in parts_of_copy(pipeline, copy)
+    )
+
+
+def parts_of_copy(pipeline: Pipeline, placement: Copy) -> Iterator[Part]:
+    """Yield the parts of one copy of a cycle."""
     for name in pipeline.tasks:
         yield Site(name, placement[name])
     for flow in pipeline.flows:
         message = message_of(flow.source, flow.target, placement)
         if message is not None:
             yield message
+
+
+def job_columns(problem: Problem, placement: Placement) -> list[Site | None]:
+    """Return the site of each column of tasks in the evidence; None for no job.
+
+    In a cell with replicas the tasks of the second copy follow the tasks of the first.
+    """
+    tasks = problem.pipeline.tasks
+    sites: list[Site | None] = [Site(name, placement.first[name]) for name in tasks]
+    if isinstance(placement, Replicas):
+        doubled, second = placement.doubled, placement.second
+        sites += [Site(name, second[name]) if name in doubled else None for name in tasks]
+    elif problem.replicas:
+        sites += [None] * len(sites)
+    return sites
+
+
+def message_columns(problem: Problem, placement: Placement) -> list[Message | None]:
+    """Return the message of each column of flows in the evidence; None for none, or if held."""
+    flows = problem.pipeline.flows
+    messages = [message_of(flow.source, flow.target, placement.first) for flow in flows]
+    if isinstance(placement, Replicas):
+        # The evidence does not show when a held message was sent.
+        doubled = {*placement.doubled}
+        held = [placement.after_ms > 0 and flow.source not in doubled for flow in flows]
+        messages += [
+            message_of(flow.source, flow.target, placement.second)
+            if not is_held and not doubled.isdisjoint((flow.source, flow.target))
+            else None
+            for flow, is_held in zip(flows, held, strict=True)
+        ]
+    elif problem.replicas:
+        messages += [None] * len(messages)
+    return messages
 
 
 def patience_of(problem: Problem, parts: Iterable[Part]) -> list[int]:
@@ -83,8 +124,6 @@ class Meter:
         self._problem, self._pipeline = problem, problem.pipeline
         self._shared = shared
         self._patience_ns = patience_ns(problem)
-        names = list(problem.pipeline.tasks)
-        self._sources = np.array([names.index(f.source) for f in problem.pipeline.flows], np.int64)
         self._placements = tuple(problem.candidates.values())
         every = (parts_of(problem.pipeline, placed) for placed in self._placements)
         self.parts = tuple(dict.fromkeys(part for parts in every for part in parts))
@@ -111,7 +150,7 @@ class Meter:
                 NodeJobs(cores_on(problem, one, partial(cores_of, one)), True, one.cores, one.spare)
                 for one in sharing
             ],
-            len(problem.pipeline.flows),
+            len(message_columns(problem, self._placements[0])),
         )
 
     def times(self, evidence: Evidence) -> dict[Part, Floats]:
@@ -243,8 +282,12 @@ class Meter:
     def _cores_received(self, placement: Placement, foreign: Mapping[str, float]) -> Floats:
         """Return the average cores of each task's job next to foreign threads."""
         received = []
-        for name, task in self._pipeline.tasks.items():
-            node, execution = self._problem.fabric.nodes[placement[name]], task.on[placement[name]]
+        for site in job_columns(self._problem, placement):
+            if site is None:
+                received.append(0.0)
+                continue
+            node = self._problem.fabric.nodes[site.node]
+            execution = self._pipeline.tasks[site.task].on[site.node]
             cores = cores_of(node, execution)
             if execution.accelerator is None:
                 cores /= slowdown(node, execution.threads, foreign.get(node.name, 0.0))
@@ -278,18 +321,36 @@ class Meter:
     def _layout(self, active: int) -> CyclesLayout:
         """Return the parts of cycles under a candidate, and of their shadows."""
         if active not in self._layouts:
-            pipeline, here = self._pipeline, self._placements[active]
-            ways = [(here, frozenset(pipeline.tasks))]
-            ways += [(there, pipeline.diverging(here, there)) for there in self._placements]
-            shared = [[flow.source not in own for flow in pipeline.flows] for _, own in ways]
+            pipeline, problem, here = self._pipeline, self._problem, self._placements[active]
+            own = [*job_columns(problem, here), *message_columns(problem, here)]
+            rows = [[-1 if part is None else self._number[part] for part in own]]
+            shared = [[False] * len(message_columns(problem, here))]
+            for there in self._placements:
+                if problem.replicas:
+                    # A cell with replicas has no shadows.
+                    rows, shared = [*rows, [-1] * len(own)], [*shared, shared[0]]
+                    continue
+                apart = pipeline.diverging(here.first, there.first)
+                rows.append(self._columns(there.first, apart))
+                shared.append([flow.source not in apart for flow in pipeline.flows])
             self._layouts[active] = CyclesLayout(
-                self._sources,
-                np.array([self._columns(*way) for way in ways], np.int64),
-                np.array(shared, np.bool_).reshape(len(ways), -1),
+                self._sources(here),
+                np.array(rows, np.int64),
+                np.array(shared, np.bool_).reshape(len(rows), -1),
             )
         return self._layouts[active]
 
-    def _columns(self, placement: Placement, tasks: Collection[str]) -> list[int]:
+    def _sources(self, placement: Placement) -> Ints:
+        """Return the column of the sender of each column of flows."""
+        names, flows = list(self._pipeline.tasks), self._pipeline.flows
+        sources = [names.index(flow.source) for flow in flows]
+        if self._problem.replicas:
+            sources += [
+                row + len(names) * isinstance(placement[names[row]], tuple) for row in sources
+            ]
+        return np.array(sources, np.int64)
+
+    def _columns(self, placement: Copy, tasks: Collection[str]) -> list[int]:
         """Return the part of each task in `tasks`, then of each flow to them; -1 for others."""
         parts: list[Part | None] = [
             Site(name, placement[name]) if name in tasks else None for name in self._pipeline.tasks
@@ -309,14 +370,19 @@ def _shares_evenly(node: Node, shared: Collection[str]) -> bool:
 
 
 def cores_on(problem: Problem, node: Node, cores: Callable[[Execution], float]) -> Floats:
-    """Return the cores of each task's job on a node, shape (candidates, tasks); 0 elsewhere."""
-    found = np.zeros((len(problem.candidates), len(problem.pipeline.tasks)))
-    for row, placed in zip(found, problem.candidates.values(), strict=True):
-        for column, (name, task) in enumerate(problem.pipeline.tasks.items()):
-            execution = task.on[placed[name]]
-            if placed[name] == node.name and execution.accelerator is None:
-                row[column] = cores(execution)
-    return found
+    """Return the cores of each task's job on a node, shape (candidates, columns); 0 elsewhere."""
+    found = [
+        [
+            cores(execution)
+            if site is not None
+            and site.node == node.name
+            and (execution := problem.pipeline.tasks[site.task].on[site.node]).accelerator is None
+            else 0.0
+            for site in job_columns(problem, placed)
+        ]
+        for placed in problem.candidates.values()
+    ]
+    return np.array(found, np.float64)
 
 
 def cores_of(node: Node, execution: Execution) -> float:

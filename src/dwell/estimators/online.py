@@ -20,7 +20,7 @@ from dwell.estimators.cell_terms import CellTerms
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
-from dwell.estimators.measured import Message, Meter, Part, groups, parts_of
+from dwell.estimators.measured import Message, Meter, Part, groups, job_columns, parts_of
 from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
@@ -319,12 +319,13 @@ class Online(CellEstimator):
             return
         cycles, placements = evidence.cycles, tuple(self.problem.candidates.values())
         lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
-        names = list(self.problem.pipeline.tasks)
         ended_ns: dict[str, int] = {}
         ready_ns: dict[str, list[int]] = {}
         for code, rows in groups(evidence.placement):
-            for column, name in enumerate(names):
-                node = placements[code][name]
+            for column, site in enumerate(job_columns(self.problem, placements[code])):
+                if site is None:
+                    continue
+                node = site.node
                 latest = int(cycles.end_ns[rows, column].max())
                 ended_ns[node] = max(ended_ns.get(node, -1), latest)
                 mine = cycles.ready_ns[rows, column][lost[rows, column]]
@@ -378,11 +379,11 @@ class Online(CellEstimator):
 
     def _sent_under(self, name: str) -> Mapping[str, float]:
         """Return the share of each resource that shadow jobs take under a candidate."""
-        problem, here = self.problem, self.problem.candidates[name]
+        problem, here = self.problem, self.problem.candidates[name].first
         pipeline, resources = problem.pipeline, problem.fabric.resources
         fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share, rates = dict.fromkeys(resources, 0.0), pipeline.rates
-        for there in problem.candidates.values():
+        for there in (placement.first for placement in problem.candidates.values()):
             apart = pipeline.diverging(here, there)
             # In the order of tasks: the order of a set, and the rounding of the sum, may differ.
             for task in pipeline.tasks:

@@ -230,7 +230,7 @@ class _Search:
 
     def run(self) -> None:
         """Look at all placements, or at the most that are allowed."""
-        for placement in self._problem.candidates.values():
+        for placement in (one.first for one in self._problem.plain_candidates.values()):
             if not self._is_overloaded(placement):
                 self._measure(placement)
         stack = [_Open(0.0, tuple(bounds.root for bounds in self._bounds))]
@@ -283,7 +283,7 @@ class _Search:
             return
         objective, found = self._problem.objective, []
         for sample in self._samples:
-            measured = sample.measure(placement)
+            measured = sample.measure(placement.first)
             qos = measured.qos
             found.append(
                 (Ranked(placement, qos, cost(qos, placement, placement, objective)), measured)
@@ -322,7 +322,9 @@ class _Search:
 
     def _rank(self, one: Ranked) -> tuple[float, list[int]]:
         nodes = list(self._problem.fabric.nodes)
-        return one.cost, [nodes.index(one.placement[task]) for task in self._problem.pipeline.tasks]
+        return one.cost, [
+            nodes.index(one.placement.first[task]) for task in self._problem.pipeline.tasks
+        ]
 
     def _exceeds(self, bound: float) -> bool:
         """Whether a bound is above J of the last placement to return."""

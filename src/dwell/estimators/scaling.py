@@ -42,7 +42,7 @@ from dwell.estimators.spans import NS_PER_MS, flow_patience_ns, spans_ms
 from dwell.model.bounds import VALUE, shown
 from dwell.model.number_arrays import Floats
 from dwell.model.order_statistic import percentile
-from dwell.model.placement import Placement
+from dwell.model.placement import Copy
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.semantics import nearest
@@ -95,7 +95,7 @@ class Scaling(Learning):
         self._on_path = {name for name in names if rates[name]}
         #: Longest known time of each task, alone on its node, milliseconds.
         self._longest: dict[Site, float] = {}
-        self._active: Placement | None = None
+        self._active: Copy | None = None
         #: Times of jobs (each alone) and of messages in the last window, milliseconds, by cycle.
         self._jobs, self._messages = np.empty((0, 0)), np.empty((0, 0))
         #: Whether each task is due in each cycle of the last window.
@@ -104,7 +104,7 @@ class Scaling(Learning):
     def _take_in(self, evidence: Evidence) -> None:
         super()._take_in(evidence)
         newest = int(evidence.placement[-1])
-        active = tuple(self.problem.candidates.values())[newest]
+        active = tuple(self.problem.candidates.values())[newest].first
         self._has_changed |= active != self._active
         self._active = active
         if self._ratios or self._bounds:
@@ -113,7 +113,7 @@ class Scaling(Learning):
 
     def _keep_cycles(self, evidence: Evidence, newest: int) -> None:
         """Keep the times of the cycles under the newest placement."""
-        active = tuple(self.problem.candidates.values())[newest]
+        active = tuple(self.problem.candidates.values())[newest].first
         rows = evidence.placement == newest
         cycles = evidence.cycles.at(rows)
         work_ns = self._meter.work_ns(evidence.cycles, evidence.placement, self._threads)[rows]
@@ -172,10 +172,10 @@ class Scaling(Learning):
         has_path = self.problem.objective.latency is None
         if self._active is not None and len(self._jobs) and has_path:
             for name, placement in self.problem.candidates.items():
-                estimates[name] = self._at_least(estimates[name], placement, self._active)
+                estimates[name] = self._at_least(estimates[name], placement.first, self._active)
         return estimates
 
-    def _at_least(self, qos: QoS, placement: Placement, active: Placement) -> QoS:
+    def _at_least(self, qos: QoS, placement: Copy, active: Copy) -> QoS:
         """Raise metrics to at least the metrics of the window's cycles without queues."""
         pipeline, columns = self.problem.pipeline, list(self.problem.pipeline.tasks)
         executed = [
@@ -211,9 +211,7 @@ class Scaling(Learning):
             cut_from_ms=max(qos.uncut_l95_ms, bound_ms),
         )
 
-    def _executed(
-        self, column: int, task: str, active: Placement, placement: Placement
-    ) -> Floats | None:
+    def _executed(self, column: int, task: str, active: Copy, placement: Copy) -> Floats | None:
         """Return a bound on the time of a task's job in each cycle; None if unknown."""
         here, there, alone_ms = active[task], placement[task], self._jobs[:, column]
         if here == there or task not in self._on_path:

@@ -13,10 +13,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.measured import Message, message_of, parts_of, sending_ns
+from dwell.estimators.measured import Message, message_of, parts_of_copy, sending_ns
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import Realisation
-from dwell.model.placement import Placement
+from dwell.model.placement import Copy
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowFraction, ShadowPlan, by_candidate
 
@@ -54,12 +54,15 @@ def hindered(problem: Problem) -> frozenset[str]:
     """Return the candidates whose own jobs may have to wait for shadows."""
     return frozenset(
         name
-        for name, here in problem.candidates.items()
-        if any(_is_hindered(problem, here, there) for there in problem.candidates.values())
+        for name, here in problem.plain_candidates.items()
+        if any(
+            _is_hindered(problem, here.first, there.first)
+            for there in problem.plain_candidates.values()
+        )
     )
 
 
-def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
+def _is_hindered(problem: Problem, here: Copy, there: Copy) -> bool:
     """Return whether own jobs may wait if cycles are also sent through another candidate.
 
     They may if shadow messages use an own link that keeps messages in order, if shadow messages
@@ -68,7 +71,7 @@ def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
     """
     pipeline, links = problem.pipeline, problem.fabric.links
     apart = pipeline.diverging(here, there)
-    own_links = {part.link for part in parts_of(pipeline, here) if isinstance(part, Message)}
+    own_links = {part.link for part in parts_of_copy(pipeline, here) if isinstance(part, Message)}
     held_ns = 0.0
     for flow in pipeline.flows:
         # A shadow job sends its sampled outputs; a shared job sends none to the shadow.
@@ -84,7 +87,7 @@ def _is_hindered(problem: Problem, here: Placement, there: Placement) -> bool:
     return not _scarce(problem, here, pipeline.tasks).isdisjoint(_scarce(problem, there, shadowed))
 
 
-def _scarce(problem: Problem, placement: Placement, tasks: Iterable[str]) -> set[str]:
+def _scarce(problem: Problem, placement: Copy, tasks: Iterable[str]) -> set[str]:
     """Return the accelerators, and the CPUs with a quota, that tasks use."""
     found = set()
     for name in tasks:

@@ -242,7 +242,8 @@ def processes_of(
     """
     pipeline, fabric = problem.pipeline, problem.fabric
     rates, sent = pipeline.rates, dict.fromkeys(fabric.links, 1)
-    for flow, placement in itertools.product(pipeline.flows, problem.candidates.values()):
+    placements = [copy for one in problem.candidates.values() for copy in one.copies]
+    for flow, placement in itertools.product(pipeline.flows, placements):
         crossed = f"{placement[flow.source]}->{placement[flow.target]}"
         sent[crossed] = max(sent.get(crossed, 1), pipeline.message_rate(flow))
     yield frozenset(fabric.nodes), pipeline.release_jitter_ms, 1

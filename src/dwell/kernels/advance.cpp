@@ -38,6 +38,45 @@ void mark_undue(const S& s, i64 cell, i64 cycle, i64 n_tasks, const i64* flows, 
   }
 }
 
+// Instant at which the node of a task hears that a cycle is done; `kLastNs` for never.
+template <class S>
+i64 heard_ns(const S& s, i64 cell, i64 cycle, i64 task) {
+  const i64 row = (s.cell(cell).candidate_0 + s.stamp(cell, cycle)) * s.n_tasks;
+  const i64 done_ns = s.cell(cell).release_ns[cycle] + s.latency_ns[s.output(cell, cycle)];
+  const i64 node = s.sites[s.site_of[row + task]].node;
+  for (i64 first = 0; first < s.n_tasks; ++first) {
+    const i32 site = s.site_of[row + first];
+    const bool is_heard = site >= 0 && s.sites[site].node == node && s.hear_ns[row + first] >= 0;
+    if (is_heard) return later(done_ns, s.hear_ns[row + first]);
+  }
+  return kLastNs;
+}
+
+// Marks what was cancelled in a cycle with replicas that is done: it shows no loss.
+template <class S>
+void mark_cancelled(const S& s, i64 cell, i64 cycle, i64 n_tasks, const i64* flows, i64 n_flows,
+                    i64* ready_ns) {
+  const i64 candidate = s.cell(cell).candidate_0 + s.stamp(cell, cycle);
+  if (s.after_ns[candidate] < 0 || s.outcome[s.output(cell, cycle)] != kDone) return;
+  i64 *end_ns = ready_ns + n_tasks, *arrived_ns = end_ns + n_tasks;
+  i64 *work_ns = arrived_ns + n_flows, *start_ns = work_ns + n_tasks;
+  const i64 copies = s.cell(cell).copies;
+  for (i64 i = 0; i < n_flows; ++i) {
+    if (arrived_ns[i] >= 0) continue;
+    i64 source = s.flow(cell, flows[i]).source;
+    if (s.site_of[candidate * s.n_tasks + source] < 0) source -= copies;
+    const i32 hop = s.route[candidate * s.n_flows + flows[i]];
+    const bool may_repeat = hop < 0 || s.links[s.hops[hop].link].retransmit_ns >= 0;
+    const bool is_stopped = end_ns[source] >= heard_ns(s, cell, cycle, source);
+    if (may_repeat || is_stopped) arrived_ns[i] = kNotDue;
+  }
+  for (i64 task = 0; task < n_tasks; ++task) {
+    const bool is_lost = s.log_outcome[s.log_entry(cell, cycle, task)] != kInFlight;
+    if (end_ns[task] >= 0 || (ready_ns[task] >= 0 && is_lost)) continue;
+    ready_ns[task] = end_ns[task] = work_ns[task] = start_ns[task] = kNotDue;
+  }
+}
+
 }  // namespace
 }  // namespace dwell
 
@@ -82,6 +121,7 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
       for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
       if (tables->clock[0].has_rates && cell == cell_0) {
         mark_undue(s, cell, cycle, n_tasks, flows, n_flows, out);
+        mark_cancelled(s, cell, cycle, n_tasks, flows, n_flows, out);
       }
       out = start_ns + n_tasks;
     }

@@ -33,7 +33,11 @@ void handle(S& s, i64 key, i64 now) {
       }
       break;
     case kStart:
-      if (!is_given_up(s, cell, cycle)) note_ready(s, job_key(cell, cycle, item));
+      if (S::kRates && item >= s.n_tasks) {
+        hear(s, cell, cycle, item - s.n_tasks);
+      } else if (!is_given_up(s, cell, cycle)) {
+        start_source(s, cell, cycle, item);
+      }
       break;
     case kRetry:
       if (is_forward(s, item)) {

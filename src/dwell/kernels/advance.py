@@ -61,11 +61,12 @@ class LoggedCycles:
     def window(self, first: int, last: int) -> WindowRows:
         """Return the logs of the cycles `first` to `last` - 1."""
         part, n, count = self._of.part, last - first, len(self._flows)
-        table = np.empty((n, part.rows * (1 + 4 * part.tasks + count)), np.int64)
-        beside = np.empty((n, part.rows, part.tasks, 2), np.int64) if self._has_shared else None
-        rows = WindowRows(table, part.tasks, count, beside)
+        tasks = part.copies * part.tasks
+        table = np.empty((n, part.rows * (1 + 4 * tasks + count)), np.int64)
+        beside = np.empty((n, part.rows, tasks, 2), np.int64) if self._has_shared else None
+        rows = WindowRows(table, tasks, count, beside)
         _logged()(
-            *(self._of.whole.address, part.row, part.rows, first, n, part.tasks),
+            *(self._of.whole.address, part.row, part.rows, first, n, tasks),
             *(self._flows_at, count, rows.row.rows, rows.beside_address),
         )
         return rows

@@ -23,9 +23,10 @@ from dwell.kernels.codes import (
 )
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.kernels.rows import Rows, Tables, row_types
-from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota
+from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Replicas
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Ints
+from dwell.model.placement import Copy
 from dwell.model.window_close import close_after_ns, window_close_ns
 
 SCHEDULERS = {"fair": Scheduler.FAIR, "fifo": Scheduler.FIFO, "priority": Scheduler.PRIORITY}
@@ -54,6 +55,8 @@ class CellPart(NamedTuple):
         Numbers of these items in the cell.
     candidate_0, hop_0, site_0 : int
         Rows of its first candidate, hop and site.
+    copies : int
+        Columns of each task and flow in the logs: two if candidates have replicas, else one.
     """
 
     row: int
@@ -66,6 +69,7 @@ class CellPart(NamedTuple):
     candidates: int
     hop_0: int
     site_0: int
+    copies: int
 
 
 class Arrays:
@@ -212,7 +216,7 @@ class Arrays:
 
 #: Tables with rows by cell.
 BY_CELL = (
-    *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome"),
+    *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome", "late_copies"),
     *("actuated_ns", "actuated_from"),
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
@@ -262,7 +266,7 @@ class CellArrays:
                 rows["shadow_bytes"] = whole.shadow_bytes[part.row, cycles]
             self._tables = whole._replace(
                 **rows,
-                site_of=whole.site_of[candidates, : part.tasks],
+                site_of=whole.site_of[candidates, : part.copies * part.tasks],
                 back_ns=whole.back_ns[candidates],
             )
         return self._tables
@@ -272,7 +276,7 @@ class CellArrays:
         whole, part = self.whole.tables, self.part
         shape = len(whole.cells), int(whole.clock[0]["n_cycles"]), -1
         own = slice(part.row, part.row + part.rows), slice(part.cycles)
-        tasks = *own, slice(part.tasks)
+        tasks = *own, slice(part.copies * part.tasks)
         log, outcome = whole.log.reshape(shape), whole.log_outcome.reshape(shape)
         arrived, taken = (
             table.reshape(shape)[own] for table in (whole.log_arrived, whole.log_taken)
@@ -332,8 +336,8 @@ class _Layout:
         ]
         self.shadows = shadows if any(one is not None for one in shadows) else ()
         self.cycles = max(real.cycles for _, real in cells)
-        self.max_tasks = max(len(problem.pipeline.tasks) for problem, _ in cells)
-        self.max_flows = max(len(problem.pipeline.flows) for problem, _ in cells)
+        self.max_tasks = max(_copies(problem) * len(problem.pipeline.tasks) for problem, _ in cells)
+        self.max_flows = max(_copies(problem) * len(problem.pipeline.flows) for problem, _ in cells)
         self.max_resources = max(len(problem.fabric.resources) for problem, _ in cells)
         self.node_row: dict[tuple[int, str], int] = {}
         self.server_row: dict[tuple[int, str | None], int] = {}
@@ -356,6 +360,8 @@ class _Layout:
         self.site_of: list[list[int]] = []
         self.route: list[list[int]] = []
         self.back_ns: list[int] = []
+        self.after_ns: list[int] = []
+        self.hear_ns: list[list[int]] = []
         self.shadow_parts: list[list[ShadowPart]] = []
         self.changes: list[Rows] = []
 
@@ -387,6 +393,7 @@ class _Layout:
             candidates=len(problem.candidates),
             hop_0=len(self.rows["hops"]),
             site_0=len(self.rows["sites"]),
+            copies=_copies(problem),
         )
 
     def _addresses(self, table: Ints) -> list[int]:
@@ -485,7 +492,9 @@ class _Layout:
             "decide_cycles": self.decide_cycles[index],
             "look_cycle": self.decide_cycles[index],
             "task_0": len(self.rows["tasks"]),
-            "n_tasks": part.tasks,
+            "n_tasks": _copies(problem) * part.tasks,
+            "copies": part.tasks if problem.replicas else 0,
+            "flow_copies": len(flows) if problem.replicas else 0,
             "flow_0": len(self.rows["flows"]),
             "candidate_0": part.candidate_0,
             "n_candidates": part.candidates,
@@ -512,16 +521,19 @@ class _Layout:
             self.server_row[self.node_row[index, one.node], one.kind or None] for one in resources
         ]
         self.capacity += [one.capacity for one in resources]
-        self._add_pipeline(pipeline, flows)
+        for copy in range(_copies(problem)):
+            self._add_pipeline(pipeline, flows, copy)
 
-    def _add_pipeline(self, pipeline: Pipeline, flows: Sequence[Flow]) -> None:
-        """Add the tasks of a cell, and its flows in the order of `ordered_flows`."""
+    def _add_pipeline(self, pipeline: Pipeline, flows: Sequence[Flow], copy: int) -> None:
+        """Add a copy of the tasks of a cell, and of its flows in the order of `ordered_flows`."""
         names = list(pipeline.tasks)
-        flow_row = {(flow.source, flow.target): i for i, flow in enumerate(flows)}
+        flow_row = {
+            (flow.source, flow.target): i for i, flow in enumerate(flows, copy * len(flows))
+        }
         self.rows["flows"] += [
             {
-                "source": names.index(flow.source),
-                "target": names.index(flow.target),
+                "source": copy * len(names) + names.index(flow.source),
+                "target": copy * len(names) + names.index(flow.target),
                 "is_sampled": flow.sampled,
                 "every": pipeline.message_rate(flow),
             }
@@ -569,16 +581,38 @@ class _Layout:
         site_row = self._add_sites(index, problem, real, names)
         self._add_forwards(problem, real, hop_0 + len(real.hops), site_row)
         for placement in problem.candidates.values():
-            on = [site_row[name, placement[name]] for name in names]
+            on: list[int] = []
+            hop_of: list[int] = []
+            doubled = placement.doubled if isinstance(placement, Replicas) else ()
+            for copy in placement.copies:
+                is_first = copy is placement.first
+                on += [
+                    site_row[name, copy[name]] if is_first or name in doubled else -1
+                    for name in names
+                ]
+                hop_of += [
+                    hop_row.get((f.source, f.target, f"{copy[f.source]}->{copy[f.target]}"), -1)
+                    for f in ordered_flows(problem.pipeline)
+                ]
             self.site_of.append(on + [-1] * (self.max_tasks - len(on)))
-            hop_of = [
-                hop_row.get(
-                    (f.source, f.target, f"{placement[f.source]}->{placement[f.target]}"), -1
-                )
-                for f in ordered_flows(problem.pipeline)
-            ]
             self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
-            self.back_ns.append(back_ns(problem, placement))
+            self.back_ns.append(back_ns(problem, placement.first))
+            self._add_hearing(problem, placement)
+
+    def _add_hearing(self, problem: Problem, placement: Placement) -> None:
+        """Add when second copies may be sent, and when nodes hear that a cycle is done."""
+        hear: list[int] = []
+        if isinstance(placement, Replicas):
+            ways_ns, tasks = hear_ns(problem, placement), problem.pipeline.tasks
+            nodes = [copy[name] for copy in placement.copies for name in tasks]
+            # Only the first task of a node.
+            hear = [
+                ways_ns[node] if node not in nodes[:row] else -1 for row, node in enumerate(nodes)
+            ]
+            self.after_ns.append(round(placement.after_ms * 1e6))
+        else:
+            self.after_ns.append(-1)
+        self.hear_ns.append(hear + [-1] * (self.max_tasks - len(hear)))
 
     def _add_forwards(
         self,
@@ -603,7 +637,8 @@ class _Layout:
     def _add_pairs(self, problem: Problem) -> None:
         """Add the roles of the tasks for a shadow, by pair of candidates."""
         for active, other in itertools.product(problem.candidates.values(), repeat=2):
-            self.shadow_parts.append(shadow_parts(problem.pipeline, active, other))
+            parts = shadow_parts(problem.pipeline, active.first, other.first)
+            self.shadow_parts.append(parts + [ShadowPart.SHARED] * (self.max_tasks - len(parts)))
 
     def _add_shadow(
         self, index: int, problem: Problem, real: Realisation, link_row: Mapping[str, int]
@@ -783,7 +818,8 @@ class _Layout:
             "n_resources": self.max_resources,
             "has_shared": len(self.cells) > 1 and bool(self.shared),
             "has_rates": any(
-                problem.pipeline.has_rates or problem.pipeline.chains for problem, _ in self.cells
+                problem.pipeline.has_rates or problem.pipeline.chains or problem.replicas
+                for problem, _ in self.cells
             ),
             "n_chains": chains,
             "n_cycles": cycles,
@@ -832,6 +868,7 @@ class _Layout:
             "actuated_from": (cells, chains, cycles),
             "shadow_bytes": (cells if self.shadows else 0, cycles),
             "log_outcome": logged * self.max_tasks,
+            "late_copies": (cells * any(problem.replicas for problem, _ in self.cells), cycles),
         }
         lists: dict[str, list[Any]] = {
             "outputs": self.outputs,
@@ -841,6 +878,7 @@ class _Layout:
             "capacity": self.capacity,
             "site_of": self.site_of,
             "back_ns": self.back_ns,
+            "after_ns": self.after_ns,
         }
         tables: dict[str, NDArray[Any]] = {
             **{name: _table(name, of, room.get(name, 0)) for name, of in rows.items()},
@@ -855,6 +893,7 @@ class _Layout:
             "forwarded": np.full(len(rows["forwards"]), -1),
             "values": np.full((len(rows["sites"]) * clock["has_rates"], self.max_flows), -1),
             "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
+            "hear_ns": np.array(self.hear_ns, np.int64).reshape(-1, self.max_tasks),
             "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
             "soonest_ns": np.full((len(self.site_of), self.max_tasks), -1),
         }
@@ -906,11 +945,14 @@ class _Layout:
         self.rows["clock"][0]["n_events"] = len(first)
 
 
-def back_ns(problem: Problem, placement: Placement) -> int:
+def _copies(problem: Problem) -> int:
+    """Rows of each task and flow of a cell: two if candidates have replicas."""
+    return 2 if problem.replicas else 1
+
+
+def back_ns(problem: Problem, placement: Copy) -> int:
     """Time from a completion until the guard learns of it, of the farthest sink, nanoseconds."""
-    pipeline = problem.pipeline
-    sinks = {placement[task] for task in pipeline.tasks if not pipeline.outputs(task)}
-    return way_back_ns(problem, sinks)
+    return way_back_ns(problem, {placement[task] for task in problem.pipeline.sinks})
 
 
 def way_back_ns(problem: Problem, from_nodes: Collection[str]) -> int:
@@ -918,17 +960,32 @@ def way_back_ns(problem: Problem, from_nodes: Collection[str]) -> int:
 
     The time is the least sum of mean delays of links to the stamper's node; 0 without a path.
     """
-    links = problem.fabric.links.values()
-    to_ms = {problem.stamper_node: 0.0}
-    reached = [(0.0, problem.stamper_node)]
+    ways_ms = _ways_ms(problem, problem.stamper_node)
+    return round(max(ways_ms.get(node, 0.0) for node in from_nodes) * 1e6)
+
+
+def hear_ns(problem: Problem, placement: Placement) -> dict[str, int]:
+    """Time from the completion of a cycle until each node hears of it; -1 for never."""
+    ways = {}
+    for name in problem.fabric.nodes:
+        ways_ms = _ways_ms(problem, name)
+        ms = max(ways_ms.get(placement.first[task], np.inf) for task in problem.pipeline.sinks)
+        ways[name] = round(ms * 1e6) if ms < np.inf else -1
+    return ways
+
+
+def _ways_ms(problem: Problem, end: str) -> dict[str, float]:
+    """Return the least sum of mean delays over links to a node, from each node that reaches it."""
+    to_ms = {end: 0.0}
+    reached = [(0.0, end)]
     while reached:
         ms, node = heapq.heappop(reached)
-        for link in links:
+        for link in problem.fabric.links.values():
             further_ms = ms + link.delay_ms.expectation
             if link.target == node and further_ms < to_ms.get(link.source, np.inf):
                 to_ms[link.source] = further_ms
                 heapq.heappush(reached, (further_ms, link.source))
-    return round(max(to_ms.get(node, 0.0) for node in from_nodes) * 1e6)
+    return to_ms
 
 
 def ordered_flows(pipeline: Pipeline) -> list[Flow]:
@@ -943,7 +1000,13 @@ def flow_rows(pipeline: Pipeline) -> Ints:
     return np.array([order.index(flow) for flow in pipeline.flows], np.int64)
 
 
-def shadow_parts(pipeline: Pipeline, active: Placement, other: Placement) -> list[ShadowPart]:
+def flow_columns(problem: Problem) -> Ints:
+    """Return the rows of the flows of a cell's first copies, then of its second copies, if any."""
+    rows = flow_rows(problem.pipeline)
+    return np.concatenate([rows, rows + len(rows)]) if problem.replicas else rows
+
+
+def shadow_parts(pipeline: Pipeline, active: Copy, other: Copy) -> list[ShadowPart]:
     """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 
     A task is shadowed if it, or any task before it, runs on another node; a sink behind such tasks

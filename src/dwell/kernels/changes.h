@@ -68,9 +68,10 @@ template <class S>
       const bool waits = 0 < job.missing && job.missing < s.task(cell, task).n_in;
       if (waits && s.site(job).node == node) {
         lose(s, cell, slot.cycle, task, kNodeDown);
-        job.missing = kNever;
+        if (!await_again(s, cell, slot.cycle, task)) job.missing = kNever;
       }
     }
+    lose_held(s, cell, slot.cycle, node);
   }
 }
 

@@ -52,6 +52,8 @@ constexpr int kKindShift = kCellShift + kCellBits;
 constexpr i64 kItemMask = (i64{1} << kItemBits) - 1;
 constexpr i64 kCycleMask = (i64{1} << kCycleBits) - 1;
 constexpr i64 kCellMask = (i64{1} << kCellBits) - 1;
+// An instant of a job or message that is not due in its cycle, or that was cancelled.
+constexpr i64 kNotDue = -2;
 // Marks an arrival event that loses the message; numbers of flows are smaller.
 constexpr i64 kLostOnLink = i64{1} << (kItemBits - 1);
 // Marks a job on the ready list that a worker has already taken, in a bit of the kind, which is 0.

@@ -58,7 +58,7 @@ void append_input(S& s, Site& site, i64 cycle, Job& job) {
   if (site.waiting == 0) {
     site.head = cycle;
   } else {
-    s.job(site.cell, site.tail, site.task).next = cycle;
+    s.job(site.cell, site.tail, task_at(s, site, site.tail)).next = cycle;
   }
   site.tail = cycle;
   site.waiting += 1;
@@ -68,9 +68,31 @@ void append_input(S& s, Site& site, i64 cycle, Job& job) {
 template <class S>
 i64 pop_input(S& s, Site& site) {
   const i64 cycle = site.head;
-  site.head = s.job(site.cell, cycle, site.task).next;
+  site.head = s.job(site.cell, cycle, task_at(s, site, cycle)).next;
   site.waiting -= 1;
   return cycle;
+}
+
+// Removes the job of a cycle from the jobs that wait at a site; returns whether it was there.
+template <class S>
+[[gnu::noinline]] bool remove_input(S& s, Site& site, i64 cycle) {
+  i64 before = -1, waits = site.head;
+  for (i64 i = 0; i < site.waiting; ++i) {
+    const i64 next = s.job(site.cell, waits, task_at(s, site, waits)).next;
+    if (waits == cycle) {
+      if (before < 0) {
+        site.head = next;
+      } else {
+        s.job(site.cell, before, task_at(s, site, before)).next = next;
+      }
+      if (site.tail == waits) site.tail = before;
+      site.waiting -= 1;
+      return true;
+    }
+    before = waits;
+    waits = next;
+  }
+  return false;
 }
 
 // Puts a job whose inputs are complete on the ready list; `settle` handles it after the event.
@@ -100,7 +122,8 @@ bool become_ready(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
       drop_job(s, cell, cycle, task, kReplaced, now);
       return false;
     }
-    drop_job(s, cell, pop_input(s, site), task, kReplaced, now);
+    const i64 oldest = pop_input(s, site);
+    drop_job(s, cell, oldest, task_at(s, site, oldest), kReplaced, now);
   }
   append_input(s, site, cycle, job);
   return false;
@@ -114,13 +137,16 @@ void free_worker(S& s, Site& site) {
     return;
   }
   const i64 cycle = pop_input(s, site);
-  note_ready(s, job_key(site.cell, cycle, site.task) | kTaken);
+  note_ready(s, job_key(site.cell, cycle, task_at(s, site, cycle)) | kTaken);
 }
 
 // Loses all jobs that wait at a site, because its node went down.
 template <class S>
 void drop_waiting(S& s, Site& site, i64 now) {
-  while (site.waiting > 0) drop_job(s, site.cell, pop_input(s, site), site.task, kNodeDown, now);
+  while (site.waiting > 0) {
+    const i64 cycle = pop_input(s, site);
+    drop_job(s, site.cell, cycle, task_at(s, site, cycle), kNodeDown, now);
+  }
 }
 
 // Whether the shadow of a cycle stops before a task.
@@ -153,7 +179,8 @@ void finish_shadow(S& s, i64 shadow, i64 cycle, i64 now) {
 template <class S>
 void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   const Flow& ends = s.flow(cell, flow);
-  Job& job = s.job(cell, cycle, ends.target);
+  const i64 target = end_of(s, cell, cycle, ends.target);
+  Job& job = s.job(cell, cycle, target);
   if (!S::kPlain && s.log_arrived.size > 0) {
     s.log_arrived[s.log_row(cell, cycle) * s.n_flows + flow] = now;
   }
@@ -166,12 +193,16 @@ void hand_over(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
     }
     return;
   }
+  if (is_late(s, cell, cycle, flow, target)) {
+    s.slot(cell, cycle).live -= 1;
+    return;
+  }
   job.missing -= 1;
-  if (job.missing == 0 && !is_discarded(s, cell, cycle, ends.target)) {
-    const Job& sender = s.job(cell, cycle, ends.source);
+  if (job.missing == 0 && !is_discarded(s, cell, cycle, target)) {
+    const Job& sender = s.job(cell, cycle, end_of(s, cell, cycle, ends.source));
     job.compute_ns = sender.compute_ns;
     job.network_ns = now - sender.network_ns;
-    note_ready(s, job_key(cell, cycle, ends.target));
+    note_ready(s, job_key(cell, cycle, target));
   } else {
     s.slot(cell, cycle).live -= 1;
     if (job.missing == 0) finish_shadow(s, cell, cycle, now);
@@ -183,7 +214,7 @@ template <class S>
 void arrive(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
   Outcome loss = kDropped;
   if (!(flow & kLostOnLink)) {
-    const Job& job = s.job(cell, cycle, s.flow(cell, flow).target);
+    const Job& job = s.job(cell, cycle, end_of(s, cell, cycle, s.flow(cell, flow).target));
     if (!s.server(s.site(job)).is_down) {
       hand_over(s, cell, cycle, flow, now);
       return;
@@ -211,6 +242,7 @@ void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
   S::fetch_next(s.latency_ns[row]);
   S::fetch_next(s.compute_ns[row]);
   S::fetch_next(s.network_ns[row]);
+  announce_done(s, cell, cycle, now);
 }
 
 // Number of messages that a task sends in a cycle.
@@ -258,6 +290,28 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   }
 }
 
+// Sends the outputs of a common task to second copies of tasks, or holds them until `after_ns`.
+template <class S>
+[[gnu::noinline]] void send_to_second(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
+  const Cell& of = s.cell(cell);
+  const Task& from = s.task(cell, task + of.copies);
+  const i64 after_ns = s.after_ns[s.slot(cell, cycle).candidate];
+  const i64 due_ns = later(of.release_ns[cycle], after_ns);
+  for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
+    const i64 flow = s.outputs[i];
+    if (s.job(cell, cycle, s.flow(cell, flow).target).site < 0) continue;
+    s.slot(cell, cycle).live += 1;
+    if (now < due_ns) {
+      attempts_of(s, cell, cycle, flow) = kIsHeld;
+      s.post(due_ns, make_key(kRetry, cell, cycle, flow));
+    } else if (const i64 hop = s.hop(cell, cycle, flow); hop < 0) {
+      hand_over(s, cell, cycle, flow, now);
+    } else {
+      send(s, cell, cycle, flow, hop, 0, now);
+    }
+  }
+}
+
 // Completes a job, unless its announcement is invalid.
 template <class S>
 void complete(S& s, i64 key, i64 now) {
@@ -274,17 +328,61 @@ void complete(S& s, i64 key, i64 now) {
   free_worker(s, site);
   if (s.task(cell, task).n_out == 0) {
     finish(s, cell, cycle, task, job, now);
+  } else if (has_replicas(s, cell, cycle) && job.missing == kHeard) {
+    s.slot(cell, cycle).live -= 1;
   } else {
     job.network_ns = now - job.network_ns;
+    const bool sends_twice = has_replicas(s, cell, cycle) && is_common(s, cell, cycle, task);
     send_outputs(s, cell, cycle, task, now);
+    if (sends_twice) send_to_second(s, cell, cycle, task, now);
   }
 }
 
-// Sends a message again after a lost attempt.
+// Sends a message again after a lost attempt, or at the end of its hold.
 template <class S>
 void retry(S& s, i64 cell, i64 cycle, i64 flow, i64 now) {
-  const i64 attempt = s.attempts[s.slot_row(cell, cycle) * s.n_flows + flow] + 1;
-  send(s, cell, cycle, flow, s.hop(cell, cycle, flow), attempt, now);
+  i64& attempts = attempts_of(s, cell, cycle, flow);
+  const i64 hop = s.hop(cell, cycle, flow);
+  // The node of a held message went down.
+  if (S::kRates && s.slot(cell, cycle).cycle != cycle) return;
+  if (has_replicas(s, cell, cycle)) {
+    if (attempts == kUnsent) return;
+    if (is_stopped(s, cell, cycle, flow)) {
+      s.slot(cell, cycle).live -= 1;
+      end_repeats(s, make_key(kArrival, cell, cycle, flow), now);
+      return;
+    }
+    if (attempts == kIsHeld) attempts = kUnsent;
+    if (hop < 0) {
+      hand_over(s, cell, cycle, flow, now);
+      return;
+    }
+  }
+  send(s, cell, cycle, flow, hop, attempts + 1, now);
+}
+
+// Starts a source, unless its node has heard that the cycle is done.
+template <class S>
+void start_source(S& s, i64 cell, i64 cycle, i64 task) {
+  if (has_replicas(s, cell, cycle) && s.job(cell, cycle, task).missing == kHeard) {
+    s.slot(cell, cycle).live -= 1;
+  } else {
+    note_ready(s, job_key(cell, cycle, task));
+  }
+}
+
+// Lets the node of a task hear that a cycle is done: its jobs no longer wait in inputs.
+template <class S>
+[[gnu::noinline]] void hear(S& s, i64 cell, i64 cycle, i64 task) {
+  Slot& slot = s.slot(cell, cycle);
+  if (slot.cycle != cycle || slot.live == 0) return;
+  const i64 node = s.site(s.job(cell, cycle, task)).node;
+  for (i64 other = 0; other < s.cell(cell).n_tasks; ++other) {
+    Job& job = s.job(cell, cycle, other);
+    if (job.site < 0 || s.site(job).node != node) continue;
+    job.missing = kHeard;
+    if (remove_input(s, s.site(job), cycle)) slot.live -= 1;
+  }
 }
 
 // Removes a running or waiting job of a shadow; its worker takes the next waiting job.
@@ -297,21 +395,7 @@ void withdraw(S& s, i64 key, Job& job, i64 now) {
     free_worker(s, site);
     return;
   }
-  i64 before = -1, waits = site.head;
-  for (i64 i = 0; i < site.waiting; ++i) {
-    if (waits == cycle_of(key)) {
-      if (before < 0) {
-        site.head = job.next;
-      } else {
-        s.job(site.cell, before, site.task).next = job.next;
-      }
-      if (site.tail == waits) site.tail = before;
-      site.waiting -= 1;
-      return;
-    }
-    before = waits;
-    waits = s.job(site.cell, waits, site.task).next;
-  }
+  remove_input(s, site, cycle_of(key));
 }
 
 // Gives up a shadow that is still unfinished too many cycles later, when cycle `released` begins.
@@ -362,6 +446,8 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
     job.site = s.site_of[candidate * s.n_tasks + task];
     job.compute_ns = 0;
     job.network_ns = 0;
+    const bool is_copy = is_second(s, cell, task);
+    if (is_copy && job.site < 0) continue;
     if (S::kRates) {
       if (!s.is_due(fixed, cycle)) continue;
       sinks += fixed.n_out == 0;
@@ -375,7 +461,10 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
       if (part != kShadowed) continue;
     }
     ++sources;
-    if (!is_shadow && fixed.offset_ns == 0) {
+    if (is_copy) {
+      const i64 after_ns = std::max(fixed.offset_ns, s.after_ns[candidate]);
+      s.post(later(now, after_ns), make_key(kStart, cell, cycle, task));
+    } else if (!is_shadow && fixed.offset_ns == 0) {
       note_ready(s, job_key(cell, cycle, task));
     } else {
       s.post(now + fixed.offset_ns, make_key(kStart, cell, cycle, task));
@@ -383,6 +472,9 @@ void begin_cycle(S& s, i64 cell, i64 cycle, i64 active, bool is_shadow, i64 now)
   }
   s.slot(cell, cycle) =
       Slot{cycle, static_cast<i32>(candidate), static_cast<i32>(pair), sources, sinks, kNothing};
+  if (has_replicas(s, cell, cycle)) {
+    std::fill_n(&attempts_of(s, cell, cycle, 0), s.n_flows, kUnsent);
+  }
   if (sinks > 0) return;
   if (is_shadow) {
     s.latency_ns[s.output(cell, cycle)] = 0;

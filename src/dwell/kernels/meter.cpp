@@ -5,8 +5,8 @@
 #include <cmath>
 #include <limits>
 
+#include "codes.h"
 #include "export.h"
-#include "rows.h"
 
 namespace dwell {
 
@@ -40,7 +40,7 @@ bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
     add(found, part, static_cast<f64>(end_ns - begin_ns) / 1e6);
     return true;
   }
-  if (begin_ns >= 0 && begin_ns < limit_ns) {
+  if (begin_ns >= 0 && begin_ns < limit_ns && end_ns != kNotDue) {
     add(found, part, std::numeric_limits<f64>::infinity());
   }
   return false;

@@ -30,6 +30,8 @@ template <class S>
 void lose(S& s, i64 cell, i64 cycle, i64 task, Outcome outcome) {
   Slot& slot = s.slot(cell, cycle);
   if (slot.is_lost == kOutcome) return;
+  // The other copy has completed the cycle.
+  if (S::kRates && s.outcome[s.output(cell, cycle)] == kDone) return;
   if (!is_needed(s, cell, cycle, task)) {
     slot.is_lost = kUnneeded;
     return;

@@ -34,6 +34,7 @@ from dwell.model import (
 from dwell.model.bounds import short
 from dwell.model.instants import HORIZON_NS
 from dwell.model.number_arrays import Floats, Ints
+from dwell.model.placement import Copy
 from dwell.model.scenario import RAMP_STEPS
 
 NS_PER_MS = 1e6
@@ -671,13 +672,19 @@ def _hop_name(hop: tuple[str, str, str]) -> str:
     return f"{link}/{source}->{target}"
 
 
+def _placements(problem: Problem) -> Iterator[Copy]:
+    """Yield the placements of the copies of each candidate."""
+    for placement in problem.candidates.values():
+        yield from placement.copies
+
+
 def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
     """Return flows with the links that they use in some candidate, by flow, then by link."""
     hops: dict[tuple[str, str, str], None] = {}
     for flow in problem.pipeline.flows:
         crossed = {
             f"{placement[flow.source]}->{placement[flow.target]}"
-            for placement in problem.candidates.values()
+            for placement in _placements(problem)
         }
         for link in problem.fabric.links:
             if link in crossed:
@@ -691,7 +698,7 @@ def _forwards(problem: Problem) -> Iterator[tuple[str, str, str]]:
     for flow in problem.pipeline.flows:
         if not flow.sampled:
             continue
-        hosts = {placement[flow.target] for placement in problem.candidates.values()}
+        hosts = {placement[flow.target] for placement in _placements(problem)}
         for link in problem.fabric.links.values():
             if {link.source, link.target} <= hosts:
                 yield flow.source, flow.target, link.name
@@ -718,7 +725,7 @@ def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
     for name, task in problem.pipeline.tasks.items():
         if task.state_bytes == 0:
             continue
-        hosts = dict.fromkeys(placement[name] for placement in problem.candidates.values())
+        hosts = dict.fromkeys(placement[name] for placement in _placements(problem))
         for link in problem.fabric.links.values():
             if {link.source, link.target} <= hosts.keys():
                 yield name, name, link.name

@@ -4,6 +4,7 @@
 // every event on a server its remainder is computed again.
 #pragma once
 
+#include "replicas.h"
 #include "turns.h"
 
 namespace dwell {
@@ -78,6 +79,7 @@ bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {
     const Slot& slot = s.slot(cell, cycle);
     for (i64 task = 0; task < of.n_tasks; ++task) {
       const Job& job = s.job(cell, cycle, task);
+      if (S::kRates && job.site < 0) continue;
       if (s.site(job).server != below.above) continue;
       const Task& of_job = s.task(cell, task);
       const bool runs = s.is_due(of_job, cycle);
@@ -86,7 +88,8 @@ bool is_awaited(const S& s, const Server& below, const Site& site, i64 now) {
       const i64 next_ns = later(due_ns, of.period_ns);
       if (cycle == last && next_ns < end_ns && s.is_due(of_job, cycle + 1)) return true;
       const bool is_due = runs && due_ns < end_ns && now < next_ns;
-      if (is_due && job.ready_ns < 0 && slot.is_lost == kNothing) return true;
+      const bool is_over = slot.is_lost != kNothing || job.missing == kHeard;
+      if (is_due && job.ready_ns < 0 && !is_over) return true;
     }
   }
   return false;

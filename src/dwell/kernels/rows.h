@@ -43,7 +43,7 @@ struct Crossing;  // of meter.cpp
   field(i64, n_slots) field(i64, n_tasks) field(i64, n_flows) field(i64, n_layers)               \
   field(i64, n_resources) /* of a cell */                                                        \
   field(i64, has_shared) /* whether cells have servers in common */                              \
-  field(i64, has_rates) /* whether tasks skip cycles, flows are sampled, or chains exist */      \
+  field(i64, has_rates) /* whether tasks skip cycles, flows are sampled, or chains or replicas exist */ \
   field(i64, n_cycles) field(i64, n_windows) field(i64, n_looks)                                 \
   field(i64, n_priced) /* columns of the outputs */                                              \
   field(i64, n_chains) /* of a cell */                                                           \
@@ -65,7 +65,9 @@ struct Crossing;  // of meter.cpp
 // the patience for a chain may end. `patience_ns` is the guard's for cycles.
 // `decide_cycles` is the number of cycles between decisions that are more frequent than windows; 0
 // for one decision per window. The next decision looks at cycles before `look_cycle`. `since` is
-// the first cycle under the placement in force, and `look_0` the first decision after it.
+// the first cycle under the placement in force, and `look_0` the first decision after it. If
+// candidates have replicas, the second copies of the `copies` tasks and of the `flow_copies` flows
+// follow the first copies (replicas.h); else both are 0.
 // `latency_chain` is the chain whose data age counts as latency, -1 for none.
 #define DWELL_CELL(field)                                                                        \
   field(Times, release_ns) field(i64, due_ns) field(i64, grace_ns)                               \
@@ -79,6 +81,7 @@ struct Crossing;  // of meter.cpp
   field(i64, given_up_after) /* cycles after which a shadow is given up */                       \
   field(i32, task_0) field(i32, n_tasks) field(i32, flow_0) field(i32, candidate_0)              \
   field(i32, n_candidates) field(i32, n_sinks) field(i32, pair_0)                                \
+  field(i32, copies) field(i32, flow_copies)                                                     \
   field(i32, sampled_0) field(i32, n_sampled) /* in `sampled` */                                 \
   field(i32, forward_0) field(i32, n_forwards) /* in `forwards` */                               \
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
@@ -368,6 +371,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Clock, clock) table(Cell, cells) table(Task, tasks) table(Flow, flows)                   \
   table(i32, outputs) table(i32, sampled) table(i32, sink_rates) table(i32, cell_servers) table(f64, capacity) table(Node, nodes)           \
   table(i32, site_of) table(i32, route) table(i64, back_ns) table(i8, shadow_parts)              \
+  table(i64, after_ns) table(i64, hear_ns)                                                       \
   table(Hop, hops) table(Forward, forwards) table(Times, layers) table(Segment, segments) table(Rate, rates)              \
   table(Change, changes) table(f64, work) table(f64, switching)               \
   table(i8, tiers) table(i16, stamps)                                                            \
@@ -380,6 +384,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(i64, forwarded) table(Chain, chains) table(i32, origins)                                 \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
+  table(i64, late_copies)                                                                        \
   table(i64, actuated_ns) table(i64, actuated_from)                                              \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \

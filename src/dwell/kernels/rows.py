@@ -102,6 +102,8 @@ class Tables(NamedTuple):
     route: NDArray[np.int32]  # (candidates, flows) -> hop, or -1 on the same node
     back_ns: Ints  # (candidates,) time from a completion until the guard learns of it
     shadow_parts: NDArray[np.int8]  # (pairs of candidates, tasks)
+    after_ns: Ints  # (candidates,) hold of the second copy, -1 without replicas
+    hear_ns: Ints  # (candidates, tasks) time from done until the task's node hears of it; or -1
     hops: Rows  # (hops,)
     forwards: Rows  # (forwards,)
     layers: NDArray[np.uint64]  # (hops, layers) address of the extra delays, 0 for none
@@ -144,6 +146,7 @@ class Tables(NamedTuple):
     compute_ns: Ints
     network_ns: Ints
     outcome: NDArray[np.int8]
+    late_copies: Ints  # (cells, N) messages that came after the other copy's; or empty
     actuated_ns: Ints  # (cells, chains, N) completion of a chain's last task, or NEVER_NS
     actuated_from: Ints  # (cells, chains, N) the origin of this actuation
     opened: Floats  # (cells, windows, PARTS, resources) at first releases

@@ -5,8 +5,6 @@
 
 namespace dwell {
 
-// An instant of a job or message that is not due in its cycle.
-constexpr i64 kNotDue = -2;
 // The value of a sampled input without a message.
 constexpr i64 kNoValue = -1;
 

@@ -8,7 +8,7 @@ from dwell.model.frozen import FrozenDict
 from dwell.model.live import Endpoint, Host, LiveSettings
 from dwell.model.objective import AIM, Caps, MissCap, Objective, Targets, Tier, Weights
 from dwell.model.pipeline import Execution, Flow, Pipeline, Task
-from dwell.model.placement import Placement
+from dwell.model.placement import Placement, Replicas
 from dwell.model.problem import Problem
 from dwell.model.process import (
     AR1,
@@ -69,6 +69,7 @@ __all__ = [
     "QoS",
     "Quota",
     "Reason",
+    "Replicas",
     "Scenario",
     "Servo",
     "Targets",

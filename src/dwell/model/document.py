@@ -17,7 +17,7 @@ from dwell.model.fabric import Link, Node
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Task
-from dwell.model.placement import Placement
+from dwell.model.placement import Placement, Replicas
 from dwell.model.problem import Problem
 from dwell.model.process import DRAWN, Constant, Process, Trace, UnreadTrace
 from dwell.model.scenario import Disturbance, LinkDisturbance
@@ -167,13 +167,20 @@ def _trace(trace: Trace) -> Document:
 
 
 def relocated(placement: Placement, tasks: Mapping[str, Task]) -> dict[str, str]:
-    """Return a placement without anchored tasks, as in a document."""
-    return {name: node for name, node in placement.items() if not tasks[name].anchored}
+    """Return the placement of the first copy without anchored tasks, as in a document."""
+    return {name: node for name, node in placement.first.items() if not tasks[name].anchored}
+
+
+def _candidate(placement: Placement, tasks: Mapping[str, Task]) -> Document:
+    if not isinstance(placement, Replicas):
+        return {**relocated(placement, tasks)}
+    after = {"after_ms": placement.after_ms} if placement.after_ms else {}
+    return {"replicas": list(placement.members), **after}
 
 
 def _candidates(problem: Problem) -> Document:
     every, tasks = problem.every_placement, problem.pipeline.tasks
-    placements = {name: relocated(one, tasks) for name, one in problem.candidates.items()}
+    placements = {name: _candidate(one, tasks) for name, one in problem.candidates.items()}
     if every is None:
         return placements
     return {"all": "found" if every.is_found else True, "keep": every.keep, **placements}

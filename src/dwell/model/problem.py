@@ -20,7 +20,8 @@ from dwell.model.instants import require_length
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
-from dwell.model.placement import Placement
+from dwell.model.placement import Placement, Replicas
+from dwell.model.replicated import Replicated
 from dwell.model.scenario import Scenario
 from dwell.model.semantics import CellParts, find_faults, nearest_of
 from dwell.model.servo import Servo
@@ -106,6 +107,7 @@ class Problem(Displayed):
         if faults:
             raise ProblemError(faults)
         self._require_due_sinks()
+        self._require_supported_replicas()
 
     def __repr__(self) -> str:
         """Return a summary of its parts; `dwell.model.document` has all of it."""
@@ -140,11 +142,33 @@ class Problem(Displayed):
         bound = "timer in a cell with `every`, because each frame releases a cycle"
         require(not framed, "live.release", self.live.release, bound)
 
+    def _require_supported_replicas(self) -> None:
+        """Refuse replicas in cells whose features do not support them."""
+        pipeline = self.pipeline
+        for name, one in self.replicas.items():
+            bound = f"at most deadline_ms = {pipeline.deadline_ms:g}; lower after_ms"
+            holds = one.after_ms <= pipeline.deadline_ms
+            require(holds, f"candidates.{name}.after_ms", one.after_ms, bound)
+            members, path = list(one.members), f"candidates.{name}.replicas"
+            known = all(
+                member in self.candidates and self.candidates[member].first == copy
+                for member, copy in zip(members, one.copies, strict=True)
+            )
+            require(known, path, members, "the names of two candidates with these placements")
+            rated = pipeline.has_rates
+            bound = "absent in a cell with `every` or sampled flows; remove the candidate"
+            require(not rated, path, members, bound)
+            bound = "absent in a cell with chains; remove the candidate, or the chains"
+            require(not pipeline.chains, path, members, bound)
+            late = pipeline.deadline_ms > pipeline.period_ms
+            bound = "absent in a cell with deadline_ms above period_ms; remove the candidate"
+            require(not late, path, members, bound)
+
     def _unplaced(self) -> list[Fault]:
         """Return faults of placements without an anchored task, which only cell files may omit."""
         return [
             Fault(f"candidates.{name}.{task}", f"not placed; put it on {next(iter(on))}")
-            for name, placement in self.candidates.items()
+            for name, placement in self.plain_candidates.items()
             for task, on in ((task.name, task.on) for task in self.pipeline.tasks.values())
             if task not in placement and len(on) == 1
         ]
@@ -160,7 +184,11 @@ class Problem(Displayed):
             flows=[(f"flows[{i}]", flow) for i, flow in enumerate(pipeline.flows)],
             scales=pipeline.scales,
             chains=pipeline.chains,
-            candidates=self.candidates,
+            candidates={name: one.first for name, one in self.plain_candidates.items()},
+            replicated={
+                name: Replicated(replicas=one.members, after_ms=one.after_ms)
+                for name, one in self.replicas.items()
+            },
             every_placement=self.every_placement,
             scenarios={
                 name: [(f"scenarios.{name}[{i}]", item) for i, item in enumerate(items)]
@@ -177,6 +205,16 @@ class Problem(Displayed):
     def drawn(self) -> Drawn:
         """The part that determines its realisations."""
         return Drawn(*(getattr(self, name) for name in Drawn._fields))
+
+    @property
+    def replicas(self) -> dict[str, Replicas]:
+        """The candidates with two copies of each cycle."""
+        return {name: one for name, one in self.candidates.items() if isinstance(one, Replicas)}
+
+    @property
+    def plain_candidates(self) -> dict[str, Placement]:
+        """The candidates with one copy of each cycle."""
+        return {name: one for name, one in self.candidates.items() if one.second is None}
 
     def at_phase(self, phase_ms: float | None) -> Problem:
         """Return the problem with another offset of all its releases."""
@@ -309,7 +347,7 @@ class Problem(Displayed):
         given = self.controller.shadow_fraction
         if not isinstance(given, str):
             return given
-        alternatives = max(len(self.candidates) - 1, 1)
+        alternatives = max(len(self.plain_candidates) - 1, 1)
         together = 1.0 if self.every_placement is None else SHADOWED_TOGETHER
         return min(SHADOWED, together / alternatives)
 
@@ -371,7 +409,7 @@ class Problem(Displayed):
         """
         pipeline = self.pipeline
         source = next(name for name in pipeline.tasks if not pipeline.inputs(name))
-        return self.candidates[self.initial][source]
+        return self.candidates[self.initial].first[source]
 
     def require_node(self, name: str) -> None:
         """Raise a ProblemError that lists the nodes if the cell has no such node."""

@@ -23,6 +23,7 @@ from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Tier
 from dwell.model.pipeline import Flow, Task
+from dwell.model.replicated import Replicated, replica_faults
 from dwell.model.scenario import (
     MAX_LAYERS,
     RAMP_LAYERS,
@@ -70,6 +71,7 @@ class CellParts:
     scales: Collection[str] = ()
     chains: Mapping[str, Chain] = field(default_factory=dict)
     candidates: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    replicated: Mapping[str, Replicated] = field(default_factory=dict)
     broken_candidates: Iterable[str] = ()
     every_placement: EveryPlacement | None = None
     scenarios: Mapping[str, Sequence[tuple[str, Disturbance]]] = field(default_factory=dict)
@@ -78,6 +80,11 @@ class CellParts:
     accelerators: Mapping[str, Tier] = field(default_factory=dict)
     latency: str | None = None
     live: LiveSettings | None = None
+
+    @property
+    def candidate_names(self) -> list[str]:
+        """Names of all candidates, with or without replicas, readable or not."""
+        return [*self.candidates, *self.replicated, *self.broken_candidates]
 
 
 def closest(word: str, known: Iterable[str], likeness: float = 0.6) -> str:
@@ -139,14 +146,14 @@ def find_unregistered(
     """
     if message := bad_name(name):
         yield Fault("name", message)
-    for candidate in parts.candidates:
+    for candidate in (*parts.candidates, *parts.replicated):
         if candidate in policies:
             message = f"the name {candidate!r} is a policy's; choose another for the placement"
             yield Fault(f"candidates.{candidate}", message)
     settings = parts.controller
     if settings is not None:
-        names = [*parts.candidates, *parts.broken_candidates]
-        if settings.policy not in parts.candidates and not CLASS_PATH.holds(settings.policy):
+        names = parts.candidate_names
+        if settings.policy not in names and not CLASS_PATH.holds(settings.policy):
             known = [*policies, *names]
             yield from _unknown("controller.policy", "policy", settings.policy, known)
         estimator = settings.estimator
@@ -155,7 +162,8 @@ def find_unregistered(
         # The usual estimator sends shadow jobs.
         sends = estimator is None or estimator in shadowing
         given = settings.shadow_fraction if sends else None
-        if isinstance(given, float | int) and (message := too_many_shadows(given, len(names))):
+        plain = len(names) - len(parts.replicated)
+        if isinstance(given, float | int) and (message := too_many_shadows(given, plain)):
             yield Fault("controller.shadow_fraction", message)
     yield from _columns(parts)
 
@@ -174,7 +182,7 @@ def _names(parts: CellParts) -> Iterator[Fault]:
         "tasks": parts.tasks,
         "scales": parts.scales,
         "chains": parts.chains,
-        "candidates": parts.candidates,
+        "candidates": [*parts.candidates, *parts.replicated],
         "scenarios": parts.scenarios,
     }
     for section, names in sections.items():
@@ -307,7 +315,7 @@ def _candidates(parts: CellParts) -> Iterator[Fault]:
     fallbacks = settings.fallbacks if settings is not None else ()
     yield from search_faults(every, parts.candidates, fallbacks)
     is_searched = every is not None and not every.is_found
-    if not (is_searched or parts.candidates or list(parts.broken_candidates)):
+    if not (is_searched or parts.candidate_names):
         yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
     for name, moves in parts.candidates.items():
         path = f"candidates.{name}"
@@ -315,6 +323,17 @@ def _candidates(parts: CellParts) -> Iterator[Fault]:
         yield from faults
         if not faults:
             yield from _connected(parts, path, moves)
+    yield from replica_faults(
+        parts.replicated,
+        {
+            name: {task: node for task in parts.tasks if (node := _node_of(parts, moves, task))}
+            for name, moves in parts.candidates.items()
+        },
+        parts.broken_candidates,
+        parts.tasks,
+        [flow for _, flow in parts.flows],
+        _unknown,
+    )
 
 
 def _placed(parts: CellParts, path: str, moves: Mapping[str, str]) -> Iterator[Fault]:
@@ -442,13 +461,18 @@ def _controller(parts: CellParts) -> Iterator[Fault]:
     settings = parts.controller
     if settings is None:
         return
-    names = [*parts.candidates, *parts.broken_candidates]
+    names = parts.candidate_names
     if settings.on is not None:
         yield from _unknown("controller.on", "node", settings.on, parts.nodes)
     if settings.initial is not None:
         yield from _unknown("controller.initial", "candidate", settings.initial, names)
     for index, name in enumerate(settings.fallbacks):
         yield from _unknown(f"controller.fallbacks[{index}]", "candidate", name, names)
+        if name in parts.replicated:
+            yield Fault(
+                f"controller.fallbacks[{index}]",
+                f"{name} has replicas; name a plain candidate, such as one of its members",
+            )
     if settings.migration == "cold" and parts.links_complete:
         yield from _state_transfers(parts)
 
@@ -511,7 +535,8 @@ def _columns(parts: CellParts) -> Iterator[Fault]:
             if message := bad_name(kind):
                 yield Fault(f"nodes.{name}.accelerators.{kind or repr(kind)}", message)
     resources, chains = resources_of(parts.nodes), list(parts.chains)
-    yield from table_columns.clash_faults(resources, list(parts.candidates), chains)
+    candidates = [*parts.candidates, *parts.replicated]
+    yield from table_columns.clash_faults(resources, candidates, chains)
 
 
 def too_many_shadows(fraction: float, candidates: int) -> str:

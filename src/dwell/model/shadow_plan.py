@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model.frozen import FrozenDict
+from dwell.model.placement import Placement
 
 GOLDEN = (np.sqrt(5) - 1) / 2
 
@@ -16,8 +17,12 @@ GOLDEN = (np.sqrt(5) - 1) / 2
 ShadowFraction: TypeAlias = float | Mapping[str, float]
 
 
-def by_candidate(fraction: ShadowFraction, candidates: Iterable[str]) -> FrozenDict[str, float]:
-    """Return the share of each alternative, by the active candidate."""
+def by_candidate(
+    fraction: ShadowFraction, candidates: Mapping[str, Placement]
+) -> FrozenDict[str, float]:
+    """Return the share of each alternative, by the active candidate; 0 in a cell with replicas."""
+    if any(placement.second is not None for placement in candidates.values()):
+        return FrozenDict(dict.fromkeys(candidates, 0.0))
     if isinstance(fraction, Mapping):
         return FrozenDict({name: fraction.get(name, 0.0) for name in candidates})
     return FrozenDict(dict.fromkeys(candidates, fraction))

@@ -23,9 +23,9 @@ Kind: TypeAlias = Literal[
 #: Optional features of a run: `live` processes; shadows through alternatives (`shadows`); an
 #: estimator that reports samples and age of its estimates (`support`); a cell of a `fleet`;
 #: decisions between the ends of windows (`between`); a weighed `age`; a cap on `misses`; a
-#: `chain` in place of the latency.
+#: `chain` in place of the latency; candidates with two copies (`replicas`).
 Feature: TypeAlias = Literal[
-    "live", "shadows", "support", "fleet", "between", "age", "misses", "chain"
+    "live", "shadows", "support", "fleet", "between", "age", "misses", "chain", "replicas"
 ]
 
 
@@ -92,6 +92,7 @@ UNMEASURED = "an accelerator of a live cell that was not measured"
 UNTOLD = "not counted"
 LIVE: tuple[Feature, ...] = ("live",)
 SHADOWS: tuple[Feature, ...] = ("shadows",)
+REPLICAS: tuple[Feature, ...] = ("replicas",)
 SUPPORT: tuple[Feature, ...] = ("support",)
 FLEET: tuple[Feature, ...] = ("fleet",)
 BETWEEN: tuple[Feature, ...] = ("between",)
@@ -195,6 +196,12 @@ WINDOWS = (
         "Share of these actuations whose age is over `max_age_ms`; 1 without any.",
     ),
     Column("overtaken", "Int64", "Its cycles that completed after a later cycle.", is_new=True),
+    Column(
+        "late_copies",
+        "Int64",
+        "Messages of its cycles that were dropped, because those of the other copy came first.",
+        of=REPLICAS,
+    ),
     Column("shadow_cycles", "Int64", "Cycles that were sent twice.", of=SHADOWS),
     Column("shadow_bytes", "Int64", "Bytes of shadows on links.", "bytes", of=SHADOWS),
     Column(
@@ -324,6 +331,7 @@ JOBS = (
     ),
     Column("outcome", "outcome", "Its end."),
     Column("shadow", "Boolean", "Whether it is a shadow's.", of=("live", "shadows")),
+    Column("second", "Boolean", "Whether it is of the second copy.", of=REPLICAS),
     Column(
         "cpu_ns",
         "Int64",

@@ -42,16 +42,21 @@ class Pair(NamedTuple):
 def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -> tuple[Pair, ...]:
     """Return every pair of candidates that differ in the side of one task, in candidate order."""
     pairs = []
-    for local, here in candidates.items():
-        for offload, there in candidates.items():
+    for local, here in _plain(candidates):
+        for offload, there in _plain(candidates):
             moved = here.moved(there)
             if len(moved) != 1:
                 continue
             task = moved[0]
-            outside = tiers.get(there[task]) in ("edge", "cloud")
-            if tiers.get(here[task]) == "robot" and outside:
+            outside = tiers.get(there.first[task]) in ("edge", "cloud")
+            if tiers.get(here.first[task]) == "robot" and outside:
                 pairs.append(Pair(local, offload, task))
     return tuple(pairs)
+
+
+def _plain(candidates: Mapping[str, Placement]) -> list[tuple[str, Placement]]:
+    """Return the candidates without replicas."""
+    return [(name, placed) for name, placed in candidates.items() if placed.second is None]
 
 
 class ATPThresholds(PricingPolicy):
@@ -106,7 +111,7 @@ class ATPThresholds(PricingPolicy):
         self.min_dwell = check_parameter("min_dwell", min_dwell, MIN_DWELL)
         self.pair = self._choose(local, offload)
         targets = objective.targets
-        outside_tier = objective.tiers[self.candidates[self.pair.offload][self.pair.task]]
+        outside_tier = objective.tiers[self.candidates[self.pair.offload].first[self.pair.task]]
         #: Whether the task is offloaded to a cloud node that the objective weighs separately.
         self.on_cloud = objective.weights.cloud is not None and outside_tier == "cloud"
         outside = targets.cloud if self.on_cloud and targets.cloud else targets.edge
@@ -130,7 +135,7 @@ class ATPThresholds(PricingPolicy):
 
         def robot_time_ms(pair: Pair) -> float:
             task = problem.pipeline.tasks[pair.task]
-            on_robot = task.on[problem.candidates[pair.local][pair.task]]
+            on_robot = task.on[problem.candidates[pair.local].first[pair.task]]
             scale = 1.0 if task.scale is None else problem.pipeline.scales[task.scale].expectation
             return on_robot.exec_ms.expectation * scale
 
@@ -205,7 +210,7 @@ class ATPThresholds(PricingPolicy):
     def _question(self, l95_ms: float, used: TierUtilisation) -> tuple[str, bool]:
         """Return the other side of the pair, and whether a metric exceeds its threshold."""
         task = self.pair.task
-        if self.objective.tiers.get(self.candidates[self.incumbent][task]) == "robot":
+        if self.objective.tiers.get(self.candidates[self.incumbent].first[task]) == "robot":
             other, busy = self.pair.offload, used.robot > self.robot
         else:
             outside = used.cloud if self.on_cloud else used.edge

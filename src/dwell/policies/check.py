@@ -18,6 +18,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from dwell.model.frozen import FrozenDict
+from dwell.model.placement import Nodes
 from dwell.model.problem import Problem
 from dwell.model.qos import REASONS, Decision, QoS
 from dwell.policies.protocol import MinimalPolicy
@@ -189,12 +190,12 @@ class _Check:
             self.stop(f"raises {name}", f"{name}() raised {error!r} in {where}")
 
 
-def _placements(problem: Problem) -> dict[str, dict[str, str]]:
+def _placements(problem: Problem) -> dict[str, dict[str, Nodes]]:
     return {name: dict(moves) for name, moves in problem.candidates.items()}
 
 
 def _contradictions(
-    decision: Decision, incumbent: str, placements: Mapping[str, Mapping[str, str]]
+    decision: Decision, incumbent: str, placements: Mapping[str, Mapping[str, Nodes]]
 ) -> Iterator[tuple[str, str]]:
     """Yield the kind and the description of each contradiction within a decision."""
     placement, reason, dwell = decision.placement, decision.reason, decision.dwell

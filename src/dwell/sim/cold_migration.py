@@ -7,6 +7,7 @@ from dwell.kernels.arrays import CellArrays
 from dwell.kernels.codes import CYCLE_BITS, EventKind, cycle_of, item_of, make_key
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
+from dwell.model.placement import nodes_of
 
 # The cycle field of an event contains the number of the migration, the attempt, and a ready bit.
 NUMBER_SHIFT = 20
@@ -29,25 +30,37 @@ class ColdMigration:
         self.tasks = tuple(problem.pipeline.tasks.values())
         self.hop_row = {hop: row for row, hop in enumerate(realisation.hops)}
         self.boundary = self.number = 0
-        # Hop for the state of each task that is not ready yet; -1 for a task without state.
+        # Hop for the state of each task that is not ready yet; -1 for a task without state. The
+        # second new node of a task has a number behind all tasks.
         self.hops: dict[int, int] = {}
 
     def moves(self, incumbent: str, order: str) -> bool:
-        """Whether an order moves a task."""
-        return self.candidates[incumbent] != self.candidates[order]
+        """Whether an order brings a task to a new node."""
+        return bool(self._added(incumbent, order))
+
+    def _added(self, incumbent: str, order: str) -> list[tuple[int, str, str]]:
+        """Return the tasks' rows with old and new node: of the first copy, and each node added."""
+        old, new = self.candidates[incumbent], self.candidates[order]
+        return [
+            (row, old.first[task.name], node)
+            for row, task in enumerate(self.tasks)
+            for node in nodes_of(new[task.name])
+            if node not in nodes_of(old[task.name])
+        ]
 
     def begin(
         self, arrays: CellArrays, incumbent: str, order: str, boundary: int, arrival_ns: int
     ) -> None:
         """Start a worker for every task that an order moves."""
         self.boundary, self.number = boundary, self.number + 1
-        old, new = self.candidates[incumbent], self.candidates[order]
-        for row, task in enumerate(self.tasks):
-            if old[task.name] != new[task.name]:
-                link = f"{old[task.name]}->{new[task.name]}"
-                self.hops[row] = self.hop_row.get((task.name, task.name, link), -1)
-                started_ns = arrival_ns + round(task.start_ms * 1e6)
-                self._announce(arrays, row, 0, self.hops[row] < 0, started_ns)
+        for row, here, there in self._added(incumbent, order):
+            task = self.tasks[row]
+            # A task with two new nodes has two rows.
+            item = row + len(self.tasks) * (row in self.hops)
+            hop = self.hop_row.get((task.name, task.name, f"{here}->{there}"), -1)
+            self.hops[item] = hop
+            started_ns = arrival_ns + round(task.start_ms * 1e6)
+            self._announce(arrays, item, 0, hop < 0, started_ns)
 
     def step(self, arrays: CellArrays) -> bool:
         """Process the current event; return True if the last task is ready now."""

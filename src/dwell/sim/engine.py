@@ -22,7 +22,7 @@ from dwell.control import (
 from dwell.errors import SimulationError
 from dwell.estimators.searched_cell import searched
 from dwell.kernels.advance import LoggedCycles, play
-from dwell.kernels.arrays import CellArrays, flow_rows, lay_out
+from dwell.kernels.arrays import CellArrays, flow_columns, lay_out
 from dwell.kernels.codes import BuiltInPolicy, EventKind, Status, Tier, cell_of, kind_of
 from dwell.kernels.random_draws import draw, draw_shadows
 from dwell.kernels.realisation import NodeChanges, Realisation
@@ -212,6 +212,8 @@ def play_cells(
     progress : callable, optional
         Receives the number of closed windows and the number of all windows.
     """
+    for cell in cells:
+        _require_no_guarded_replicas(cell)
     plans = [_shadow_plan(cell, shadow and cell.guarded) for cell in cells]
     whole = lay_out(
         [(cell.problem, cell.realisation) for cell in cells],
@@ -266,6 +268,15 @@ def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
     if not (probes or cell.controller.sends_shadows):
         return None
     return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
+
+
+def _require_no_guarded_replicas(cell: PlayedCell) -> None:
+    """Refuse a guard in a cell with replicas."""
+    if cell.guarded and cell.problem.replicas:
+        raise SimulationError(
+            f"the guard does not support replicas ({', '.join(cell.problem.replicas)}); run "
+            f"{cell.problem.name} without the guard, or remove them"
+        )
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:
@@ -554,7 +565,7 @@ def _evidence(
     problem: Problem, realisation: Realisation, arrays: CellArrays
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that extracts a window's evidence from the logs."""
-    logged = LoggedCycles(arrays, flow_rows(problem.pipeline))
+    logged = LoggedCycles(arrays, flow_columns(problem))
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
         rows = logged.window(first, last)

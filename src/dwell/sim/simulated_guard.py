@@ -230,7 +230,7 @@ class SimulatedGuard:
         pipeline, found = self.problem.pipeline, {}
         placed, rates = list(self.problem.candidates.values()), pipeline.rates
         for (i, active), (j, other) in permutations(enumerate(placed), 2):
-            apart = {rates[task] for task in pipeline.diverging(active, other)}
+            apart = {rates[task] for task in pipeline.diverging(active.first, other.first)}
             if apart and 1 not in apart:
                 found[i, j] = np.array(sorted(apart), np.int64)[:, np.newaxis]
         return found
@@ -324,7 +324,7 @@ class _Actuations:
         pipeline, self._arrays = problem.pipeline, arrays
         self._row, target = list(pipeline.chains).index(name), pipeline.chains[name].target
         placed = problem.candidates.values()
-        self._back_ns = np.array([way_back_ns(problem, {one[target]}) for one in placed])
+        self._back_ns = np.array([way_back_ns(problem, {one.first[target]}) for one in placed])
         # First cycle whose actuation the guard may not know yet.
         self._first = 0
 

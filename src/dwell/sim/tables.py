@@ -100,6 +100,7 @@ class PlayedRealisation:
         has: dict[Feature, bool] = {
             "shadows": len(self.arrays.tables.cells) > 1,
             "age": self.problem.objective.weighs_age,
+            "replicas": bool(self.problem.replicas),
             "chain": self.problem.objective.latency is not None,
         }
         return tuple(feature for feature, there in has.items() if there)
@@ -297,6 +298,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "cost": seen["cost"],
             **_age_columns(played),
             "overtaken": lambda: played.by_window(played.overtaken).sum(axis=1),
+            **_replica_columns(played),
             **_shadow_columns(played),
         }
     )
@@ -329,6 +331,14 @@ def _on_ages(ages_ns: Callable[[], Ints], metric: Callable[[Ints], Floats]) -> F
 def _ages_ns(played: PlayedRealisation, number: int) -> Ints:
     """Return the data ages of a chain by window."""
     return played.by_window(chain_ages_ns(played.realisation, played.arrays, number))
+
+
+def _replica_columns(played: PlayedRealisation) -> dict[str, Callable[[], Ints]]:
+    """Return the late messages of the cycles of each window."""
+    if not played.problem.replicas:
+        return {}
+    late = played.arrays.tables.late_copies[0]
+    return {"late_copies": lambda: played.by_window(late).sum(axis=1)}
 
 
 def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
@@ -468,13 +478,14 @@ def _jobs(played: PlayedRealisation) -> pl.DataFrame:
         problem,
         {
             "cycle": cycle,
-            "task": Names(task, tasks),
+            "task": Names(task % len(tasks), tasks),
             "node": Names(node[cell, cycle, task], nodes),
             "ready_ns": picked["ready_ns"],
             "start_ns": np.where(started, picked["start_ns"], NEVER_NS),
             "end_ns": np.where(ended, picked["end_ns"], NEVER_NS),
             "outcome": Names(np.where(ended, outcome[cell, cycle, task], 0), OUTCOMES),
             **({"shadow": cell > 0} if cells > 1 else {}),
+            **({"second": task >= len(tasks)} if played.problem.replicas else {}),
         },
         played.features,
     )

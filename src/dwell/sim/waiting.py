@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.kernels.arrays import CellArrays, flow_rows
+from dwell.kernels.arrays import CellArrays, flow_columns
 from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.over_age import over_age
 from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 from dwell.model.number_arrays import Ints
+from dwell.model.placement import Copy
 
 #: Waiting time in nanoseconds by ("resource", "E.gpu") or ("link", "R1->E").
 Waiting: TypeAlias = Counter[tuple[str, str]]
@@ -32,33 +34,44 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     missed &= tables.outcome[0, :last] != CycleOutcome.IDLE
     cycles = first + np.flatnonzero(missed[first:])
     logs, _, arrivals, _ = arrays.logs()
-    log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_rows(pipeline)]
+    log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_columns(problem)]
     stamps = tables.stamps[0, cycles]
-    names = [*pipeline.tasks]
+    names, n_flows = [*pipeline.tasks], len(pipeline.flows)
     waits = Waiting()
-    for code, placement in enumerate(problem.candidates.values()):
-        under = stamps == code
+    codes = [*problem.candidates]
+    for name, copy, placement in _copies(problem):
+        under = stamps == codes.index(name)
         if not under.any():
             continue
+        # Common tasks have no job in the columns of the second copy.
         of, these = log[under], cycles[under]
-        for i, task in enumerate(names):
-            node = placement[task]
+        for task in names:
+            i, node = copy * len(names) + names.index(task), placement[task]
             exec_ns = real.exec_ns[real.sites.index((task, node)), these]
             spent = of["end_ns"][:, i] - of["ready_ns"][:, i] - exec_ns
             resource = pipeline.tasks[task].on[node].resource(node)
             waits["resource", resource] += _sum(spent, of["end_ns"][:, i] >= 0)
-        for j, flow in enumerate(pipeline.flows):
+        for j, flow in enumerate(pipeline.flows, copy * n_flows):
             here, there = placement[flow.source], placement[flow.target]
             if here == there:
                 continue
             link = f"{here}->{there}"
             sent = of["end_ns"][:, names.index(flow.source)]
+            if copy and placement[flow.source] != problem.candidates[name].first[flow.source]:
+                sent = of["end_ns"][:, len(names) + names.index(flow.source)]
             own = _unhindered(
                 real, (flow.source, flow.target, link), flow.payload_bytes, these, sent
             )
             known = (sent >= 0) & (arrived[under][:, j] >= 0)
             waits["link", link] += _sum(arrived[under][:, j] - sent - own, known)
     return waits
+
+
+def _copies(problem: Problem) -> Iterator[tuple[str, int, Copy]]:
+    """Yield the name of each candidate with the number and the placement of each copy."""
+    for name, placement in problem.candidates.items():
+        for number, copy in enumerate(placement.copies):
+            yield name, number, copy
 
 
 def _sum(waited_ns: Ints, known: NDArray[np.bool_]) -> int:

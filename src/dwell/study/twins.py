@@ -49,7 +49,7 @@ def _at(cell: Problem, node: str, count: int, turn: int) -> Problem:
     }
     own = _name(node, turn)
     candidates = {
-        name: Placement({task: own if at == node else at for task, at in placed.items()})
+        name: Placement({task: own if at == node else at for task, at in placed.first.items()})
         for name, placed in cell.candidates.items()
     }
     tiers = {**objective.tiers}

@@ -41,7 +41,8 @@ def test_a_shadow_is_joined_once_by_every_task_of_its_own(
     """Behind the parting a task gets one message a flow, from the shadow if it has the source."""
     routes, pipeline = Routes(problem), problem.pipeline
     marked = stamp(active, other)
-    apart = pipeline.diverging(problem.candidates[active], problem.candidates[other])
+    here, there = (problem.candidates[name].first for name in (active, other))
+    apart = pipeline.diverging(here, there)
     sent = {
         (task, shadow): routes.destinations(task, marked, shadow=shadow)
         for task in pipeline.tasks
@@ -53,10 +54,10 @@ def test_a_shadow_is_joined_once_by_every_task_of_its_own(
             (task, shadow)
             for (task, shadow), found in sent.items()
             if task == flow.source
-            and Destination(flow.target, problem.candidates[other][flow.target], "shadow") in found
+            and Destination(flow.target, there[flow.target], "shadow") in found
         ]
         assert by == ([(flow.source, flow.source in apart)] if flow.target in apart else [])
-        usual = Destination(flow.target, problem.candidates[active][flow.target], "main")
+        usual = Destination(flow.target, here[flow.target], "main")
         assert usual in sent[flow.source, False]
 
 

@@ -42,7 +42,7 @@ def sum_of_means(
     pipeline, fabric = problem.pipeline, problem.fabric
     executed: list[Floats] = []
     for name, task in pipeline.tasks.items():
-        node = fabric.nodes[placement[name]]
+        node = fabric.nodes[placement.first[name]]
         mean_ms = task.on[node.name].exec_ms.expectation
         if task.scale is not None:
             mean_ms *= pipeline.scales[task.scale].expectation
@@ -50,7 +50,7 @@ def sum_of_means(
         executed.append(np.array(mean_ms * slower))
     sent = []
     for flow in pipeline.flows:
-        link = fabric.links.get(f"{placement[flow.source]}->{placement[flow.target]}")
+        link = fabric.links.get(f"{placement.first[flow.source]}->{placement.first[flow.target]}")
         on = [] if link is None else _on(items, link.name, begin_s, end_s)
         sent.append(0.0 if link is None else _message_ms(link, flow.payload_bytes, on))
     return float(longest_path(steps_of(pipeline), executed, sent))

@@ -465,7 +465,7 @@ class ControlledCell:
         if self._move is not None:
             self._stay(self._overruled())
         problem = self.place.problem
-        old, new = problem.candidates[self.course.placement], problem.candidates[name]
+        old, new = (problem.candidates[one].first for one in (self.course.placement, name))
         forks = tuple(
             (task.name, new[task.name])
             for task in problem.pipeline.tasks.values()
@@ -486,7 +486,7 @@ class ControlledCell:
     def _transfer_ns(self, forks: tuple[tuple[str, str], ...]) -> int:
         """Return the time to send the states of some tasks, ns, on links that they share."""
         problem = self.place.problem
-        here, transfer_s = problem.candidates[self.course.placement], 0.0
+        here, transfer_s = problem.candidates[self.course.placement].first, 0.0
         for task, to in forks:
             link = problem.fabric.links.get(f"{here[task]}->{to}")
             if link is not None:
@@ -511,7 +511,7 @@ class ControlledCell:
     def _ask_for_states(self, move: _Move, answer: Accepted) -> None:
         """Request the states of the tasks whose inputs are forked."""
         move.phase = "state"
-        old = self.place.problem.candidates[answer.placement]
+        old = self.place.problem.candidates[answer.placement].first
         for task, to in move.forks:
             number = self._next_number()
             move.awaited[number] = task

@@ -507,7 +507,7 @@ class Ledger:
         """Resource names of the accelerators that a candidate's tasks run on."""
         known = self._accelerated.get(candidate)
         if known is None:
-            placed = self._candidates[candidate].items()
+            placed = self._candidates[candidate].first.items()
             executions = ((self._pipeline.tasks[task].on[node], node) for task, node in placed)
             names = (one.resource(node) for one, node in executions if one.accelerator is not None)
             known = self._accelerated[candidate] = frozenset(names)
@@ -756,7 +756,7 @@ class Ledger:
         """Tasks that a cycle does not share with its shadow."""
         pair = cycle.placement, cycle.shadow
         if pair not in self._apart:
-            here, there = (self._candidates[name] for name in pair)
+            here, there = (self._candidates[name].first for name in pair)
             self._apart[pair] = self._pipeline.diverging(here, there)
         return self._apart[pair]
 

@@ -80,9 +80,9 @@ class SampledInputs:
 
     def _stamped(self, stamp: Stamp) -> None:
         placed = self._place.problem.candidates.get(stamp.placement)
-        if placed is None or placed[self._task] == self._at:
+        if placed is None or placed.first[self._task] == self._at:
             return
-        self._at = placed[self._task]
+        self._at = placed.first[self._task]
         if self._at == self._place.node:
             for source, last in self._left.items():
                 if source in self._values and self._values[source][0].stamp.key <= last:

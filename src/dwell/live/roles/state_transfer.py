@@ -251,7 +251,7 @@ class StateTransfer:
         problem = self.place.problem
         if not (self.stateful and problem.live.checkpoint_cycles):
             return ()
-        nodes = {problem.candidates[name][self.task] for name in problem.controller.fallbacks}
+        nodes = {problem.candidates[name].first[self.task] for name in problem.controller.fallbacks}
         return tuple(sorted(nodes - {self.place.node}))
 
     @property

@@ -53,7 +53,7 @@ class Routes:
     def runs(self, task: str, node: str, stamp: Stamp) -> bool:
         """Whether a task of a cycle runs on a node."""
         placement = self._candidates.get(stamp.placement)
-        return placement is not None and placement[task] == node
+        return placement is not None and placement.first[task] == node
 
     def shadow_ends(self, stamp: Stamp) -> frozenset[str]:
         """Return the tasks that report the end of a cycle's shadow; none without a shadow."""
@@ -62,7 +62,7 @@ class Routes:
             return frozenset()
         pair = stamp.placement, stamp.shadow
         if pair not in self._apart:
-            self._apart[pair] = self._pipeline.diverging(active, other)
+            self._apart[pair] = self._pipeline.diverging(active.first, other.first)
         return self.due.shadow_ends(self._apart[pair], stamp.cycle)
 
     def destinations(
@@ -99,8 +99,9 @@ class Routes:
                 for node in self._pipeline.tasks[flow.target].on:
                     yield Destination(flow.target, node, MAIN)
             return
-        active = self._candidates[stamp.placement]
-        other = self._candidates.get(stamp.shadow) if stamp.shadow else None
+        active = self._candidates[stamp.placement].first
+        shadowed = self._candidates.get(stamp.shadow) if stamp.shadow else None
+        other = None if shadowed is None else shadowed.first
         apart = self._pipeline.diverging(active, other) if other is not None else frozenset()
         # The cycle's tasks also send to the shadow, except for tasks that run twice.
         shares = shadow or task not in apart

@@ -190,6 +190,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
     _require_latencies(problem)
+    _require_no_replicas(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -282,7 +283,7 @@ def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
     pipeline = problem.pipeline
     return frozenset(
         (task, other[task])
-        for active, other in permutations(problem.candidates.values(), 2)
+        for active, other in permutations([one.first for one in problem.candidates.values()], 2)
         for task in pipeline.diverging(active, other)
         if pipeline.outputs(task)
     )
@@ -357,6 +358,18 @@ def _require_latencies(problem: Problem) -> None:
     ]
     if lines:
         raise LiveError("\n".join(lines))
+
+
+def _require_no_replicas(problem: Problem) -> None:
+    """Raise a LiveError if a candidate has replicas."""
+    if problem.replicas:
+        raise LiveError(
+            "\n".join(
+                f"candidates.{name}.replicas: not supported in the live cell {problem.name}: live "
+                "has no replicas yet; remove the candidate, or use dwell run"
+                for name in problem.replicas
+            )
+        )
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:

@@ -1,0 +1,111 @@
+"""Replicas in simulated runs: the hedge, prices, evidence, refusals."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import dwell
+from dwell.cellfile import from_document
+from dwell.errors import SimulationError
+from dwell.estimators.evidence import Evidence
+from dwell.estimators.measured import Meter, Site
+from dwell.estimators.profile import Profile
+from dwell.model import Problem
+from tests.reference.test_against import Probe
+
+CELL: dict[str, Any] = {
+    "dwell": 1,
+    "name": "hedge",
+    "period_ms": 200,
+    "deadline_ms": 15,
+    "window_cycles": 50,
+    "nodes": {"R": {"tier": "robot"}, "A": {"tier": "edge"}, "B": {"tier": "edge"}},
+    "links": [
+        *(
+            {"from": "R", "to": to, "delay_ms": 5, "loss": 0.01, "on_loss": {"retransmit_ms": 95}}
+            for to in "AB"
+        ),
+        *({"from": source, "to": "R", "delay_ms": 0} for source in "AB"),
+    ],
+    "tasks": {
+        "camera": {"on": {"R": {"exec_ms": 0}}},
+        "work": {"on": {"A": {"exec_ms": 0.5}, "B": {"exec_ms": 0.25}}},
+        "act": {"on": {"R": {"exec_ms": 0}}},
+    },
+    "flows": [
+        {"from": "camera", "to": "work", "bytes": 1000},
+        {"from": "work", "to": "act", "bytes": 1000},
+    ],
+    "candidates": {
+        "ONE": {"work": "A"},
+        "TWO": {"work": "B"},
+        "NOW": {"replicas": ["ONE", "TWO"]},
+        "LATER": {"replicas": ["ONE", "TWO"], "after_ms": 9.5},
+    },
+    "objective": {"weights": {"latency": 1.0}, "targets": {"latency_ms": 15}},
+    "controller": {"policy": "ONE", "decide_cycles": 50, "fallbacks": ["ONE"]},
+}
+
+
+@pytest.fixture(scope="module")
+def cell() -> Problem:
+    return from_document(CELL)
+
+
+def hedged(cell: Problem, name: str) -> tuple[float, float]:
+    """Return the share of cycles over D, and the second copies per cycle."""
+    run = dwell.simulate(cell, policy=name, seed=1, windows=1000, jobs=True)
+    assert run.jobs is not None
+    late = np.mean(run.cycles["latency_ns"].to_numpy() > 15e6)
+    return float(late), float(np.sum(run.jobs["second"].to_numpy())) / len(run.cycles)
+
+
+def test_a_second_copy_after_a_while_hedges_nearly_as_well_as_one_at_once(cell: Problem) -> None:
+    alone, now, later = (hedged(cell, name) for name in ("ONE", "NOW", "LATER"))
+    # 1e-2 alone, and 1e-4 with two links.
+    assert alone[0] == pytest.approx(1e-2, rel=0.15)
+    assert alone[1] == 0
+    assert 0 < now[0] < 3e-4
+    assert now[1] > 0.999 - 0.01
+    assert 0 < later[0] < 3e-4
+    assert later[1] == pytest.approx(1e-2, rel=0.15)
+
+
+def test_both_copies_are_paid_for(cell: Problem) -> None:
+    prices = Profile(cell)
+    assert prices.violation_rate["NOW"] < prices.violation_rate["ONE"]
+    assert prices.own["NOW"]["A"] == pytest.approx(prices.own["ONE"]["A"], rel=0.02)
+    assert prices.own["NOW"]["B"] == pytest.approx(prices.own["TWO"]["B"], rel=0.02)
+    run = dwell.simulate(cell, policy="NOW", seed=1, windows=40)
+    assert run.windows["u_A"].mean() == pytest.approx(0.5 / 200, rel=0.02)
+    assert run.windows["u_B"].mean() == pytest.approx(0.25 / 200, rel=0.02)
+
+
+def evidence(cell: Problem, name: str) -> Evidence:
+    """Return the evidence of the first window of a run under a candidate."""
+    probe = Probe(0.0)
+    dwell.simulate(cell, policy=name, estimator=probe, seed=1, windows=2)
+    return probe.evidence[0]
+
+
+def test_evidence_has_both_copies(cell: Problem) -> None:
+    times = Meter(cell).times(evidence(cell, "NOW"))
+    for node, ms in (("A", 0.5), ("B", 0.25)):
+        assert times[Site("work", node)] == pytest.approx(ms)
+        assert len(times[Site("work", node)]) >= 48
+
+
+def test_a_cancelled_copy_is_not_lost(cell: Problem) -> None:
+    seen = evidence(cell, "LATER")
+    times = Meter(cell).times(seen)
+    assert len(times[Site("work", "B")]) < 5
+    assert all(np.isfinite(values).all() for values in times.values())
+    assert (seen.cycles.ready_ns[:, 4] == -2).sum() > 45
+
+
+def test_no_guard_in_a_cell_with_replicas(cell: Problem) -> None:
+    with pytest.raises(SimulationError, match="the guard does not support replicas"):
+        dwell.simulate(cell, policy="dtp", seed=1, windows=2, guard=True)
