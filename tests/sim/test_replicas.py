@@ -109,3 +109,16 @@ def test_a_cancelled_copy_is_not_lost(cell: Problem) -> None:
 def test_no_guard_in_a_cell_with_replicas(cell: Problem) -> None:
     with pytest.raises(SimulationError, match="the guard does not support replicas"):
         dwell.simulate(cell, policy="dtp", seed=1, windows=2, guard=True)
+
+
+def test_a_search_leaves_replicas_out(cell: Problem) -> None:
+    found = dwell.search(cell, cycles=50)
+    assert sorted(dict(placement)["work"] for placement, _, _ in found) == ["A", "B"]
+
+
+def test_replicas_may_be_named_where_placements_are_searched() -> None:
+    candidates = {**CELL["candidates"], "all": True, "keep": 4}
+    controller = {"policy": "NOW", "decide_cycles": 50}
+    given = from_document({**CELL, "candidates": candidates, "controller": controller})
+    run = dwell.simulate(given, seed=1, windows=2)
+    assert list(run.problem.candidates) == ["ONE", "TWO", "NOW", "LATER"]

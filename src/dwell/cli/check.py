@@ -232,6 +232,9 @@ def _shadow_notes(
     problem: Problem, tried: Mapping[str, Sequence[ShadowPrice]], fractions: Mapping[str, float]
 ) -> Iterator[str]:
     """Yield the shares of shadows, and why they are not larger."""
+    if problem.replicas:
+        yield "shadows: none, since a candidate has replicas"
+        return
     most = problem.shadow_fraction
     if free := [name for name, fraction in fractions.items() if fraction == most]:
         yield f"shadows: {most:g} under {', '.join(free)}"

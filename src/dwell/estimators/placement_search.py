@@ -158,9 +158,10 @@ def rank(
     if cycles < (interval := problem.pipeline.sink_cycles):
         bound = f"at least {interval}, the cycles from one run to the next of the slowest sink"
         raise SimulationError(f"cycles is {cycles}; it must be {bound}")
-    # A realisation needs at least one candidate.
-    named = problem.candidates or {"first": _first_linked(problem)}
-    problem = replace(problem, candidates=named, every_placement=None)
+    # A realisation needs at least one candidate; replicas are not searched.
+    named = problem.plain_candidates or {"first": _first_linked(problem)}
+    controller = replace(problem.controller, initial=None, fallbacks=(), policy="dtp")
+    problem = replace(problem, candidates=named, every_placement=None, controller=controller)
     samples = [_sample(problem, scenario, cycles, seed) for scenario in scenarios]
     found = _Search(problem, samples, scenarios, top, most)
     found.run()
