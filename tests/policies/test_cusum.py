@@ -359,3 +359,12 @@ def test_it_shows_its_parameters() -> None:
     shown = "Cusum(initial='LOC', threshold=4, slack=0, memory=1)"
     assert repr(bare()) == shown
     assert list(itertools.islice(bare().sums, 3)) == list(CANDIDATES)
+
+
+def test_a_cell_divides_the_threshold_by_its_decisions_per_window() -> None:
+    cell = problem()
+    for share in (1, 4):
+        every = cell.window_cycles // share
+        settings = replace(cell.controller, decide_cycles=every)
+        policy = Cusum.from_problem(replace(cell, controller=settings))
+        assert policy.threshold == pytest.approx(0.4 * every / cell.window_cycles)

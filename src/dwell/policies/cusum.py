@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Self
 
 from dwell.cost import exceeds
 from dwell.model.bounds import MIN_IMPROVEMENT, Bound
@@ -33,6 +34,9 @@ from dwell.model.placement import Placement
 from dwell.model.qos import Decision, QoS, Reason
 from dwell.policies.dtp import cheapest
 from dwell.policies.incumbent import PricingPolicy, check_parameter
+
+if TYPE_CHECKING:
+    from dwell.model import Problem
 
 
 class Cusum(PricingPolicy):
@@ -47,7 +51,8 @@ class Cusum(PricingPolicy):
     candidates, initial, objective
         As in `dwell.policies.DTP`.
     threshold : float
-        Cumulative advantage that a move must exceed, in units of J.
+        Cumulative advantage that a move must exceed, in units of J. `from_problem` takes the
+        default times d/W: each of the W/d decisions of a window adds its whole gain.
     slack : float
         Part of each window's advantage that is subtracted in addition to the margin, in units of
         J.
@@ -79,6 +84,13 @@ class Cusum(PricingPolicy):
         self.threshold = check_parameter("threshold", threshold, MIN_IMPROVEMENT)
         self.slack = check_parameter("slack", slack, MIN_IMPROVEMENT)
         self.memory = check_parameter("memory", memory, Bound(0, 1, above=True))
+
+    @classmethod
+    def from_problem(cls, problem: Problem) -> Self:
+        """Make the policy with the parameters of ``problem.controller``."""
+        policy = super().from_problem(problem)
+        policy.threshold *= problem.decide_cycles / problem.window_cycles
+        return policy
 
     def __repr__(self) -> str:
         return (
