@@ -44,7 +44,7 @@ def test_the_candidates_are_the_cheapest_without_each_node_and_the_next_cheapest
         return next(one for one in ranked if node not in {one[name] for name in tasks})
 
     first = ranked[0]
-    others = [cheapest_without(node) for node in dict.fromkeys(first[name] for name in tasks)]
+    others = [cheapest_without(node) for node in dict.fromkeys(first.first[name] for name in tasks)]
     expected = list(dict.fromkeys((first, *others, *ranked)))
     assert found == dict(zip(["A1", "A2", "A3", "A4"], expected, strict=True))
     assert list(found.values()) != ranked

@@ -524,9 +524,9 @@ def window_differences(
             yield f"{where}: {row['placement']}, mixed {row['mixed']}, expected {placed}"
         if row["cost"] is not None:
             yield from cost_differences(case, row, expected, result, tolerance_ns)
-        late = sum(result.late.get(k, 0) for k in range(first, last))
-        if row.get("late_copies", late) != late:
-            yield f"{where}: late_copies {row['late_copies']}, expected {late}"
+        copies = sum(result.late.get(k, 0) for k in range(first, last))
+        if row.get("late_copies", copies) != copies:
+            yield f"{where}: late_copies {row['late_copies']}, expected {copies}"
         sent = sum(other is not None for _, other in result.stamps[first:last])
         if row.get("shadow_cycles", 0) != sent:
             yield f"{where}: shadow_cycles {row['shadow_cycles']}, expected {sent}"
