@@ -92,8 +92,13 @@ class RosRobot:
 
 
 @contextmanager
-def real_cell(folder: Path, network: RosNetwork, **controller: object) -> Iterator[RealCell]:
-    """The example's cell of ROS topics, with the ports and times of a test."""
+def real_cell(
+    folder: Path, network: RosNetwork, *, every: int = 1, **controller: object
+) -> Iterator[RealCell]:
+    """The example's cell of ROS topics, with the ports and times of a test.
+
+    The camera is due in every n-th cycle, under a timer if n is above 1.
+    """
     cell = RealCell(folder)
     given = to_document(dwell.load(EXAMPLE / "ros2.yaml"))
     document = cell.document
@@ -105,6 +110,9 @@ def real_cell(folder: Path, network: RosNetwork, **controller: object) -> Iterat
     actuators["control"]["ros2"]["type"] = TWIST
     document["live"] |= {"actuators": actuators, "silence": "zero"}
     document["controller"] |= controller
+    if every > 1:
+        document["tasks"]["camera"]["every"] = every
+        document["live"]["release"] = "timer"
     document["tasks"]["control"]["run"] = "stamped:Steer"
     cell.module.with_name("stamped.py").write_text(STAMPED)
     cell.file.write_text(yaml.safe_dump(document, sort_keys=False))
@@ -203,3 +211,24 @@ def test_killed_stages_between_two_topics_cost_at_most_the_bound_of_the_guard(
         assert "guard" in run.decisions["reason"].cast(str)
         actuated = run.cycles.filter("actuated")["number"].to_numpy()
         assert 0 < np.diff(actuated).max() - 1 <= guard_cycles + 1
+
+
+def test_a_slower_topic_is_a_source_in_every_second_cycle(tmp_path: Path) -> None:
+    with ExitStack() as stack:
+        network = stack.enter_context(ros_network())
+        network.start_router()
+        cell = stack.enter_context(real_cell(tmp_path, network, every=2))
+        robot = RosRobot(network)
+        try:
+            cell.begin()
+            cell.until(lambda status: len(robot.commands) > 20 and in_window("LOC")(status))
+        finally:
+            robot.close()
+        assert cell.end("controller") == 0
+        (folder,) = (cell.folder / "runs").iterdir()
+        run = dwell.open_run(folder)
+        actuated = run.cycles.filter("actuated")["number"].to_numpy()
+        assert len(actuated) > 0
+        assert not (actuated % 2).any()
+        idle = run.cycles.filter(run.cycles["number"] % 2 == 1)["outcome"].cast(str)
+        assert set(idle) == {"idle"}
