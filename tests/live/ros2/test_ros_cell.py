@@ -188,7 +188,7 @@ def test_killed_stages_between_two_topics_cost_at_most_the_bound_of_the_guard(
     with ExitStack() as stack:
         network = stack.enter_context(ros_network())
         network.start_router()
-        given = {"policy": "SO", "initial": "SO", "guard_cycles": guard_cycles}
+        given: dict[str, Any] = {"policy": "SO", "initial": "SO", "guard_cycles": guard_cycles}
         cell = stack.enter_context(real_cell(tmp_path, network, **given))
         robot = RosRobot(network)
         try:
