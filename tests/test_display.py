@@ -69,6 +69,7 @@ FEW_NUMBERS = {
         "Episodes",
         "Family",
         "MissCap",
+        "Replicas",
         "Move",
         "PairedDifference",
         "PairedMedian",

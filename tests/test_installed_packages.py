@@ -153,7 +153,7 @@ def test_the_registries_load_without_the_classes() -> None:
 )
 def test_the_pages_list_every_name_of_ours(registry: Mapping[str, object], page: str) -> None:
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
-    listed = re.findall(r"`([\w-]+)`", "\n".join(re.findall(r"^[|*] .*", text, re.MULTILINE)))
+    listed = re.findall(r"`([\w-]+)`", "\n".join(re.findall(r"^[-|*] .*", text, re.MULTILINE)))
     assert [name for name in registry if name not in listed] == []
 
 

@@ -56,7 +56,7 @@ def test_the_source_distribution_has_the_kernel_s_sources_and_no_library(source:
 
 def test_the_wheel_is_small_and_has_the_kernel_and_its_sources(installed: Path) -> None:
     (wheel,) = installed.parent.glob("*.whl")
-    assert wheel.stat().st_size <= 1.5e6
+    assert wheel.stat().st_size <= 1.55e6
     # The sources are what the loader holds the library against.
     load(installed / "dwell" / "kernels")
 

@@ -138,13 +138,7 @@ class Assembly:
         self._judge(parts)
         if self.faults or timing is None or objective is None or controller is None or live is None:
             return None
-        whole = _without_none(tasks)
-        fabric = self.faults.attempt(
-            *("", Fabric), nodes=_without_none(nodes), links={link.name: link for _, link in links}
-        )
-        pipeline = self.faults.attempt(
-            "", replace, timing, tasks=whole, flows=tuple(flow for _, flow in flows)
-        )
+        fabric, pipeline = self._fabric(parts), self._pipeline(parts, timing)
         if fabric is None or pipeline is None:
             return None
         return self.faults.attempt(
@@ -153,7 +147,7 @@ class Assembly:
             name=called,
             pipeline=pipeline,
             fabric=fabric,
-            candidates=_placements(named, candidates, replicated, whole),
+            candidates=_placements(named, candidates, replicated, pipeline.tasks),
             objective=objective,
             scenarios={name: tuple(item for _, item in items) for name, items in scenarios.items()},
             controller=controller,
@@ -162,6 +156,16 @@ class Assembly:
             every_placement=every,
             folder=self.home,
             **{name: entry.values[name] for name in WINDOWS if name in entry.values},
+        )
+
+    def _fabric(self, parts: CellParts) -> Fabric | None:
+        links = {link.name: link for _, link in parts.links}
+        return self.faults.attempt("", Fabric, nodes=_without_none(parts.nodes), links=links)
+
+    def _pipeline(self, parts: CellParts, timing: Pipeline) -> Pipeline | None:
+        flows = tuple(flow for _, flow in parts.flows)
+        return self.faults.attempt(
+            "", replace, timing, tasks=_without_none(parts.tasks), flows=flows
         )
 
     # ------------------------------------------------------------------ entries and values
