@@ -38,7 +38,7 @@ def test_the_cell_keeps_its_promises(
     assert not result.wrong, "\n".join([*result.wrong, capsys.readouterr().out])
     assert len(result.outcomes) >= fewest
     # Who hears nothing finds nothing wrong.
-    assert result.heard["stamped"] > 0.5 * result.actuated > 100
+    assert result.heard["stamped"] > 0.5 * result.actuated > 50
     assert {"accepted", "done", "in", "order"} <= result.heard.keys()
     assert [one.number for one, _ in islice(result.outcomes, 3)] == [1, 2, 3]
 
