@@ -214,6 +214,7 @@ def test_a_fleet_plays_steps_and_zooms(shown: Page) -> None:
 
 @in_browser
 def test_a_cell_is_reached_by_keys_and_has_a_name_for_screen_readers(shown: Page) -> None:
+    settled(shown)
     nameless = shown.evaluate("""() => [
         ...document.querySelectorAll('a, button, input, select, [role=img]')
     ].filter((one) => !one.getAttribute('aria-label') && !one.textContent.trim())
