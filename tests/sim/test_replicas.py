@@ -9,7 +9,7 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.errors import SimulationError
+from dwell.errors import ProblemError, SimulationError
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Meter, Site
 from dwell.estimators.profile import Profile
@@ -122,3 +122,9 @@ def test_replicas_may_be_named_where_placements_are_searched() -> None:
     given = from_document({**CELL, "candidates": candidates, "controller": controller})
     run = dwell.simulate(given, seed=1, windows=2)
     assert list(run.problem.candidates) == ["ONE", "TWO", "NOW", "LATER"]
+
+
+def test_a_search_keeps_named_replicas() -> None:
+    candidates = {**CELL["candidates"], "all": True, "keep": 3}
+    with pytest.raises(ProblemError, match="at least 4, the number of named candidates"):
+        from_document({**CELL, "candidates": candidates})

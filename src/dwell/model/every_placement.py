@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from dwell.errors import Fault
 from dwell.model.bounds import Bound
@@ -34,10 +34,10 @@ class EveryPlacement:
 
 
 def search_faults(
-    every: EveryPlacement | None, named: Mapping[str, object], fallbacks: Sequence[str]
+    every: EveryPlacement | None, named: Sequence[str], fallbacks: Sequence[str]
 ) -> Iterator[Fault]:
     """Yield the faults of reserved names, and of a search with too many named candidates."""
-    for name in filter(list(named).__contains__, RESERVED):
+    for name in filter(named.__contains__, RESERVED):
         message = f"the name {name!r} is a key of the search; choose another for the placement"
         yield Fault(f"candidates.{name}", message)
     if every is None:

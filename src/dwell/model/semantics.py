@@ -313,7 +313,7 @@ def _cycle(flows: Sequence[Flow]) -> list[str]:
 def _candidates(parts: CellParts) -> Iterator[Fault]:
     settings, every = parts.controller, parts.every_placement
     fallbacks = settings.fallbacks if settings is not None else ()
-    yield from search_faults(every, parts.candidates, fallbacks)
+    yield from search_faults(every, parts.candidate_names, fallbacks)
     is_searched = every is not None and not every.is_found
     if not (is_searched or parts.candidate_names):
         yield Fault("candidates", "none is declared; name at least one placement, as `LOC: {}`")
