@@ -14,7 +14,11 @@ from numpy.typing import NDArray
 from dwell.cost import hamming, price, tier_nodes
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
-from dwell.model.order_statistic import order_statistic, rank_of
+from dwell.model.order_statistic import (
+    order_statistic,
+    order_statistic_of_smallest,
+    rank_of,
+)
 from dwell.model.problem import Problem
 
 #: Age of a cycle without an actuation.
@@ -110,10 +114,7 @@ def age_l95_ms(ages_ns: Ints) -> Floats:
     """Return L95 of the ages in each window, ms; infinite for a window without actuations."""
     is_known = ages_ns != NO_AGE
     count = is_known.sum(axis=1)
-    ordered = np.sort(np.where(is_known, ages_ns / 1e6, np.inf), axis=1)
-    rank = np.maximum(rank_of(95, count), 1)
-    l95: Floats = np.take_along_axis(ordered, rank[:, None] - 1, axis=1)[:, 0]
-    return l95
+    return order_statistic_of_smallest(np.where(is_known, ages_ns / 1e6, np.inf), 95, count)
 
 
 def age_missed(ages_ns: Ints, max_age_ns: int) -> Floats:

@@ -26,7 +26,7 @@ from dwell.estimators.any_placement import AnyPlacement
 from dwell.estimators.needed_cycles import Mask, NeededCycles
 from dwell.model.fabric import Resource
 from dwell.model.number_arrays import Floats, Ints
-from dwell.model.order_statistic import order_statistic, rank_of
+from dwell.model.order_statistic import order_statistic, order_statistic_of_smallest
 from dwell.model.window_close import window_close_ns
 
 #: An instant later than all others; the sum of two stays within 64 bits.
@@ -172,8 +172,8 @@ class CostBounds:
         if self._needed.due is None:
             return order_statistic(seen_ns.reshape(-1, self._width), 95)
         windows = np.where(self._needed.due, seen_ns, FAR_NS).reshape(-1, self._width)
-        ranks = rank_of(95, self._needed.due.reshape(-1, self._width).sum(axis=1))
-        return np.take_along_axis(np.sort(windows, axis=1), ranks[:, None] - 1, axis=1)[:, 0]
+        counts = self._needed.due.reshape(-1, self._width).sum(axis=1)
+        return order_statistic_of_smallest(windows, 95, counts)
 
     def _cost_of_a_miss(self) -> Floats:
         """Return J of a miss in each cycle; 0 for idle cycles."""

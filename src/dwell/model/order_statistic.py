@@ -22,6 +22,15 @@ def order_statistic(values: NDArray[Number], percent: int) -> NDArray[Number]:
     return np.partition(values, rank - 1, axis=-1)[..., rank - 1]
 
 
+def order_statistic_of_smallest(
+    values: NDArray[Number], percent: int, counts: NDArray[np.int64]
+) -> NDArray[Number]:
+    """Return the percentile of the `counts` smallest values of each row; of none, the smallest."""
+    rank = np.maximum(rank_of(percent, counts), 1)
+    ordered = np.sort(values, axis=1)
+    return np.take_along_axis(ordered, rank[:, None] - 1, axis=1)[:, 0]
+
+
 def percentile(values: NDArray[Number], percent: int) -> float:
     """Return the percentile of values in one dimension, as a plain number."""
     return float(order_statistic(values, percent))

@@ -333,7 +333,7 @@ class Problem(Displayed):
         usual_ms, every = pipeline.deadline_ms, 1
         if chain is not None:
             every = pipeline.rates[chain.target]
-            usual_ms = chain.max_age_ms if math.isfinite(chain.max_age_ms) else usual_ms
+            usual_ms = chain.max_age_ms if chain.is_bounded else usual_ms
         bound_ms = max(4 * usual_ms, 2 * every * pipeline.period_ms)
         return max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
 

@@ -7,7 +7,6 @@ task from which it descends. docs/background/simulator.md has the rules, under "
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import count
 
@@ -42,13 +41,13 @@ class DataAges:
 
     def judge(self, cycles: Sequence[LiveCycle], close_ns: int, known: Mapping[str, int]) -> None:
         """Mark the cycles in which an actuation before the end of their window was over age."""
-        bounded = {n: one for n, one in self._chains.items() if math.isfinite(one.max_age_ms)}
+        bounded = {n: one for n, one in self._chains.items() if one.is_bounded}
         for cycle in cycles if bounded else ():
             cycle.over_age = False
         for name, chain in bounded.items():
             ages_ns, _ = self._ages(chain, cycles, known.get(name, 0), until_ns=close_ns)
             for cycle, age_ns in zip(cycles, ages_ns.tolist(), strict=True):
-                cycle.over_age |= age_ns > chain.max_age_ms * 1e6
+                cycle.over_age |= age_ns > chain.max_age_ns
 
     def values(self, cycles: Sequence[LiveCycle], known: Mapping[str, int]) -> Values:
         """Return the columns of a window; `known` as it was before the window."""
