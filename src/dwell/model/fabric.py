@@ -263,7 +263,7 @@ class Link:
         named="on_loss.retransmit_ms",
     )
     price_per_gb: float = key(
-        "Money per 10⁹ bytes that it transmits: payloads, lost and repeated ones too.",
+        "Money per 10⁹ payload bytes that it transmits, lost and repeated messages included.",
         Bound(0, LARGEST),
         default=0.0,
         is_rare=True,
