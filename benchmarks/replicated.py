@@ -21,7 +21,7 @@ GOAL = Goal(high=2.2)
 
 
 def measure(quick: bool) -> Section:
-    """Kernel time of a cycle under LOC + SO over that under each alone, undisturbed."""
+    """Kernel time of a cycle under LOC + SO over the time under each alone, undisturbed."""
     plain = dwell.load(CELL)
     both = Replicas({name: plain.candidates[name] for name in MEMBERS})
     cell = replace(plain, candidates={**plain.candidates, "BOTH": both})

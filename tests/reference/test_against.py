@@ -829,7 +829,7 @@ def play_stamped(
     core_ns = np.stack([arrays.tables.opened[0], arrays.tables.closed[0]])
     work = arrays.tables.log["work_ns"].reshape(2, real.cycles, -1)
     names = list(problem.pipeline.tasks)
-    names += map(second, names) if problem.replicas else []
+    names += [second(name) for name in names] if problem.replicas else []
     work_ns = {
         (cell, cycle, names[i]): int(work[cell, cycle, i])
         for cell, cycle, i in np.argwhere(work >= 0).tolist()
