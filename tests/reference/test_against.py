@@ -78,11 +78,11 @@ from tests.reference.simulator import (
 
 # Instant of a job or a message of a cycle in which there is none.
 NOT_DUE = -2
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "48"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "24"))
 # Of the problems that take longer: those with shadows, and those in which orders take time.
-LONGER = int(os.environ.get("DWELL_EXAMPLES", "24"))
+LONGER = int(os.environ.get("DWELL_EXAMPLES", "12"))
 #: One in so many is among the few; `make test-all` tries the others.
-ONE_IN = 4
+ONE_IN = 2
 FAIR_TOLERANCE_NS = NEAR_NS
 # Core time of a job that foreign threads interfered with is a sum of floats.
 WORK_TOLERANCE_NS = 1

@@ -506,10 +506,10 @@ def test_a_clock_that_is_set_ends_no_controller(estimator: str, node: str, jump_
     """Windows whose intervals cannot be are unproven; then the clock is known again."""
     cell = canonical(20, fallbacks=("LOC", "HYB", "SO"), estimator=estimator)
     world = World(cell, policy="dtp")
-    world.run(4_000)
+    world.run(2_000)
     before = len(columns(world, "windows", "window"))
     world.network.set_clock(node, Clock(round(jump_s * 1e3) * MS))
-    world.run(10_000)
+    world.run(8_000)
     decided = columns(world, "windows", "cost", "unproven", "seen_l95_ms")[before:]
     assert len(decided) > 10
     assert [unproven for _, unproven, _ in decided[-5:]] == [False] * 5
