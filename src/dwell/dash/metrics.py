@@ -144,8 +144,8 @@ class CellMetrics(Collector):
     def _samples(self) -> dict[str, Samples]:
         now, problem = self._observer.now(), self._problem
         health, placement = now.status["health"], now.placement
-        known = placement in problem.candidates
-        sites = problem.candidates[placement].sites if placement and known else ()
+        placed = problem.candidates.get(placement or "")
+        sites = () if placed is None else placed.sites
         # Ignore the old status if the controller does not answer.
         status: Mapping[str, Any] = {} if health == "absent" else now.status
         window, moves, processes, stages, flows = (
