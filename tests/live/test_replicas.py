@@ -14,8 +14,24 @@ import polars.testing
 import pytest
 
 from dwell.control import overtaken_cycles
-from dwell.live.wire.messages import ACTUATED, BEHIND, CANCELLED, LATE, Completion, Hop, Stamp
+from dwell.live.trust.authority import Authority
+from dwell.live.trust.keyring import Keyring
+from dwell.live.trust.permissions import senders
+from dwell.live.trust.signing import Seals
+from dwell.live.wire import channels
+from dwell.live.wire.messages import (
+    ACTUATED,
+    BEHIND,
+    CANCELLED,
+    LATE,
+    Completion,
+    Hop,
+    Stamp,
+    encode,
+)
+from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
+from dwell.model.instants import NEVER_NS
 from dwell.model.placement import Copy
 from tests.live.memory_transport import NetworkConditions
 from tests.live.replayed import (
@@ -129,6 +145,38 @@ def test_the_death_of_the_second_node_costs_no_cycle() -> None:
     assert steps(world.cycles) == {1}
     assert world.stamper.moves == []
     assert {missed for (missed,) in columns(world, "cycles", "missed")} == {False}
+
+
+@pytest.fixture
+def seals(tmp_path: Path) -> dict[str, Seals]:
+    authority = Authority.create(tmp_path, "canonical")
+    nodes = "R1", "E", "R2"
+    for node in nodes:
+        authority.issue(node, "node")
+    authority.issue("controller", "controller")
+    names = *nodes, "controller"
+    return {name: Seals(Keyring.open(tmp_path / name, cell="canonical")) for name in names}
+
+
+def test_only_signed_completions_end_a_cycle(seals: dict[str, Seals]) -> None:
+    world = ReplicatedWorld(replicated(after_ms=25), policy="BOTH", seals=seals)
+    world.run(500)
+    assert steps(world.cycles) == {1}
+    assert world.inputs_of("perception@E") == 0
+    # A worker of either copy may send to the task at which the copies meet.
+    may = senders(world.problem)[world.keys.of(channels.INPUT, "control", "R2", "main")]
+    assert may == {"R2", "E"}
+    # A completion that the sink's node has not signed is no reason to drop held messages.
+    worker = world.worker("sensing@R1")
+    world.run(10)
+    held_ns = worker.copies.due_ns
+    assert held_ns < NEVER_NS
+    stamp = Stamp(world.stamper.run, world.stamper.cycle - 1, 1, "BOTH", 0)
+    forged = encode(Completion(stamp, "control", 0, ACTUATED, (), "R2"))
+    key = world.keys.of(channels.DONE, "control")
+    world.worker("sensing@R1").receive(Arrival(key, bytes(64) + forged), world.network.now_ns)
+    assert worker.copies.due_ns == held_ns
+    assert worker.place.complained == 1
 
 
 def test_the_added_node_gets_the_state() -> None:
