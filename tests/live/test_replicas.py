@@ -14,6 +14,7 @@ import polars.testing
 import pytest
 
 from dwell.control import overtaken_cycles
+from dwell.live.roles.run_rows import columns_of
 from dwell.live.trust.authority import Authority
 from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.permissions import senders
@@ -61,10 +62,10 @@ def steps(cycles: list[int]) -> set[int]:
 
 
 def test_each_cycle_runs_in_both_copies_and_commands_once() -> None:
-    world = ReplicatedWorld(replicated(), policy="BOTH")
-    world.run(1_000)
+    world = ReplicatedWorld(replicated(window_cycles=10), policy="BOTH", jobs=True)
+    world.run(900)
     count = len(world.cycles)
-    assert count > 25
+    assert count > 22
     assert steps(world.cycles) == {1}
     for who in (*FIRST, *SECOND):
         assert world.inputs_of(who) >= count
@@ -73,7 +74,13 @@ def test_each_cycle_runs_in_both_copies_and_commands_once() -> None:
     assert world.inputs_of("control@R2") >= 2 * count - 1
     assert world.outcomes("control", "R2") == {"late": pytest.approx(count, abs=1)}
     windows = columns(world, "windows", "placement", "late_copies", "violation_rate")
-    assert {*windows} == {("BOTH", 20, 0.0)}
+    assert {*windows} == {("BOTH", 10, 0.0)}
+    # The record has the jobs of both copies.
+    order = list(columns_of(world.cell.controller, jobs=True)["jobs"])
+    places = [order.index(name) for name in ("task", "node", "outcome", "second")]
+    jobs = [tuple(row[i] for i in places) for row in world.recorder.rows["jobs"]]
+    sites = [*(one.split("@") for one in (*FIRST, *SECOND)), ["sensing", "R1"], ["control", "R2"]]
+    assert {*jobs} == {(*site, "done", "@".join(site) in SECOND) for site in sites}
 
 
 @pytest.mark.parametrize(("after_ms", "is_sent"), [(10.0, True), (25.0, False)])
@@ -81,7 +88,7 @@ def test_the_second_copy_is_sent_unless_the_cycle_is_done_by_then(
     after_ms: float, is_sent: bool
 ) -> None:
     world = ReplicatedWorld(replicated(after_ms=after_ms), policy="BOTH")
-    world.run(1_000)
+    world.run(600)
     assert steps(world.cycles) == {1}
     assert bool(world.inputs_of("perception@E")) is is_sent
     assert bool(world.inputs_of("planning@E")) is is_sent
