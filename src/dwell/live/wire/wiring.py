@@ -7,7 +7,7 @@ result.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Literal, TypeAlias
@@ -364,19 +364,24 @@ def _require_latencies(problem: Problem) -> None:
         raise LiveError("\n".join(lines))
 
 
-def _require_states_in_step(problem: Problem) -> None:
-    """Raise a LiveError if a second copy that starts later has states of its own."""
+def lagging_states(problem: Problem) -> Iterator[Fault]:
+    """Yield the second copies that start later and have states of their own."""
     tasks = problem.pipeline.tasks
-    lines = [
-        f"candidates.{name}.after_ms: {one.after_ms:g} is not supported in the live cell "
-        f"{problem.name}: {task} has a state on {' and '.join(nodes_of(one[task]))}, and the "
-        "second one misses the cycles that are done before; set it to 0"
-        for name, one in problem.replicas.items()
-        for task in one.doubled
-        if one.after_ms > 0 and tasks[task].state_bytes
-    ]
-    if lines:
-        raise LiveError("\n".join(lines))
+    for name, one in problem.replicas.items():
+        for task in one.doubled if one.after_ms > 0 else ():
+            if tasks[task].state_bytes:
+                yield Fault(
+                    f"candidates.{name}.after_ms",
+                    f"{one.after_ms:g} is not supported in live cells: {task} has a state on "
+                    f"{' and '.join(nodes_of(one[task]))}, and the second one misses the cycles "
+                    "that are done before; set it to 0",
+                )
+
+
+def _require_states_in_step(problem: Problem) -> None:
+    """Raise a LiveError with `lagging_states`."""
+    if faults := [*lagging_states(problem)]:
+        raise LiveError("\n".join(map(str, faults)))
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
