@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 27_840, "live": 16_231, "lab": 6_822}
+MOST = {"simulator": 28_035, "live": 16_238, "lab": 6_822}
 
 
 def code_lines(text: str) -> int:

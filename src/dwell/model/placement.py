@@ -70,9 +70,9 @@ class Placement(FrozenDict[str, Nodes]):
         return tuple(dict.fromkeys(site for copy in self.copies for site in copy.items()))
 
     @property
-    def hosts(self) -> frozenset[str]:
-        """Nodes of the jobs of a cycle."""
-        return frozenset(node for _, node in self.sites)
+    def nodes(self) -> frozenset[str]:
+        """The nodes on which its tasks run."""
+        return frozenset(node for copy in self.copies for node in copy.values())
 
     def moved(self, other: Placement) -> tuple[str, ...]:
         """Tasks whose set of nodes changes between the two, in this placement's order."""

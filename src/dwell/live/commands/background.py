@@ -353,7 +353,7 @@ def _moved_off(visitor: OperatorClient, node: str) -> Iterator[None]:
     clear = {
         name: [there for _, there in placement.sites].count(node)
         for name, placement in visitor.problem.candidates.items()
-        if placement.hosts.isdisjoint(status["drained"])
+        if placement.nodes.isdisjoint(status["drained"])
     }
     target = min(clear, key=lambda name: (clear[name], name != status["placement"]))
     visitor.ask("pin", target)

@@ -646,7 +646,7 @@ class ControlledCell:
 
     def _clear(self, name: str) -> bool:
         """Whether a candidate needs no node that is drained."""
-        return not self.drained & self.place.problem.candidates[name].hosts
+        return not self.drained & self.place.problem.candidates[name].nodes
 
     def _workers_ready(self, name: str, now_ns: int) -> bool:
         """Whether all workers of a candidate have sent a recent beat and are ready."""
@@ -678,7 +678,7 @@ class ControlledCell:
             case "pin":
                 if ask.about not in problem.candidates:
                     return f"no candidate {ask.about!r}; there are {', '.join(problem.candidates)}"
-                if needed := self.drained & problem.candidates[ask.about].hosts:
+                if needed := self.drained & problem.candidates[ask.about].nodes:
                     return f"{ask.about} needs {', '.join(sorted(needed))}, which is drained"
                 self.pinned = ask.about
             case "unpin":
@@ -712,9 +712,9 @@ class ControlledCell:
         if node not in problem.fabric.nodes:
             return f"no node {node!r}; there are {', '.join(problem.fabric.nodes)}"
         drained = {*self.drained, node}
-        if all(drained & placed.hosts for placed in problem.candidates.values()):
+        if all(drained & placed.nodes for placed in problem.candidates.values()):
             return f"every candidate needs {node}; nothing could run"
-        if self.pinned and node in problem.candidates[self.pinned].hosts:
+        if self.pinned and node in problem.candidates[self.pinned].nodes:
             return f"the cell is pinned to {self.pinned}, which needs {node}; unpin it first"
         self.drained = drained
         return ""

@@ -190,7 +190,7 @@ def _symptoms(
         yield f"{RATE.name} is {rate} in the last {counted(len(rates), 'window')}{_because(why)}"
     for name, found in status["failing"].items():
         placed = problem.candidates[name].sites
-        if not problem.candidates[name].hosts.isdisjoint(status["drained"]):
+        if not problem.candidates[name].nodes.isdisjoint(status["drained"]):
             continue
         why = [
             *_unreached(problem, status, found["unreached"]),

@@ -351,12 +351,16 @@ def require_candidates(problem: Problem) -> None:
 
 
 def _require_latencies(problem: Problem) -> None:
-    """Raise a LiveError if J needs ages, which live windows do not have."""
+    """Raise a LiveError if J needs ages or prices, which live windows do not have."""
     objective = problem.objective
-    keys = {"latency": objective.latency is not None, "weights.age": objective.weighs_age}
+    keys = {
+        "latency": objective.latency is not None,
+        "weights.age": objective.weighs_age,
+        "weights.price": objective.weighs_price,
+    }
     lines = [
         f"objective.{key}: not supported in the live cell {problem.name}; only the simulator "
-        "measures ages: remove it, or use dwell run"
+        "measures ages and prices: remove it, or use dwell run"
         for key, there in keys.items()
         if there
     ]
