@@ -112,7 +112,7 @@ class Stamper:
         # A continued run releases cycles at once; a new run waits for the workers of its placement.
         self._begun, self._since_ns = entry.reserved > 0, now_ns
         # Sources on other nodes get their stamps one cycle early.
-        self._early = any(node != place.node for _, node, _ in self._sources())
+        self._early = any(one.node != place.node for one in self._sources())
         self._ahead: Stamp | None = None
         self._names = tuple(problem.candidates)
         self._alternatives = alternatives(problem.candidates)
@@ -453,11 +453,11 @@ class Stamper:
     def _workers(self) -> Iterator[str]:
         """Yield the names of the workers of the current placement."""
         placed = self.place.problem.candidates[self.placement]
-        return (f"{task}@{node}" for task, node in placed.items())
+        return (f"{task}@{node}" for task, node in placed.sites)
 
     def _gates(self) -> Iterator[str]:
         """Yield the names of the sinks' processes of the current placement."""
-        placed = self.place.problem.candidates[self.placement]
+        placed = self.place.problem.candidates[self.placement].first
         return (f"sink.{task}@{placed[task]}" for task in self.place.problem.pipeline.sinks)
 
     def _release(self, released_ns: int, now_ns: int) -> None:
@@ -490,7 +490,7 @@ class Stamper:
         """Send a stamp to the sources on this node, on other nodes, or both."""
         place = self.place
         header = encode(Header(stamp, STAMPER, place.node, "none", seal=place.stamped(stamp)))
-        for task, node, kind in self.routes.destinations(STAMPER, stamp):
+        for task, node, kind, _ in self.routes.destinations(STAMPER, stamp):
             if here if node == place.node else elsewhere:
                 place.transport.put(place.keys.of(channels.INPUT, task, node, kind), b"", header)
 
