@@ -715,9 +715,7 @@ def known_instants(
     pipeline = case.problem.pipeline
     cycles = range(look.begin, look.last + 1)
     rates = Rates(pipeline)
-    due = np.array(
-        [[cell == SHADOW or rates.is_due(task, k) for task in pipeline.tasks] for k in cycles]
-    )
+    due = np.array([[rates.is_due(task, k) for task in pipeline.tasks] for k in cycles])
     ready, ended, started, work = (np.where(due, -1, NOT_DUE) for _ in range(4))
     for (whose, cycle, task), job in look.known.items():
         if whose == cell and cycle in cycles:
@@ -731,7 +729,7 @@ def known_instants(
         [
             look.arrived.get(
                 (cell, k, f.source, f.target),
-                -1 if cell == SHADOW or rates.carries(f, k) else NOT_DUE,
+                -1 if rates.carries(f, k) else NOT_DUE,
             )
             for f in pipeline.flows
         ]
