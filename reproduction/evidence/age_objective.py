@@ -55,7 +55,7 @@ over seeds. *Better*: the error is lower, and V_D is not higher, by these interv
   most 0.4 %. V_D is equal or lower in `robot-cpu-stress` and `drift`; it rises in baseline,
   `bursts`, `mixture` and `step`.
 * In `flapping` *age* raises the error. If E is loaded, or its network slow, it changes nothing.
-* *Age and V_D* changes nearly nothing: V_D and L95 prefer LOC and HYB by more than the age differs.
+* *Age and V_D* changes nearly nothing: misses decide, as with the weights of the cell.
 
 ## Which metric ranks the tracking error?
 
