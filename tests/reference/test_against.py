@@ -720,9 +720,7 @@ def known_instants(
         flows += [(flow, second(flow.source), second(flow.target)) for flow in pipeline.flows]
     cycles = range(look.begin, look.last + 1)
     rates = Rates(pipeline)
-    due = [
-        [cell == SHADOW or rates.is_due(row.partition("/")[0], k) for row in rows] for k in cycles
-    ]
+    due = [[rates.is_due(row.partition("/")[0], k) for row in rows] for k in cycles]
     ready, ended, started, work = (np.where(due, -1, NOT_DUE) for _ in range(4))
     for (whose, cycle, row), job in look.known.items():
         if whose == cell and cycle in cycles:
@@ -737,7 +735,7 @@ def known_instants(
             [
                 look.arrived.get(
                     (cell, k, source, target),
-                    -1 if cell == SHADOW or rates.carries(flow, k) else NOT_DUE,
+                    -1 if rates.carries(flow, k) else NOT_DUE,
                 )
                 for flow, source, target in flows
             ]

@@ -143,9 +143,11 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
         beside += 2;
       }
       for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
-      if (tables->clock[0].has_rates && cell == cell_0) {
+      if (tables->clock[0].has_rates) {
         mark_undue(s, cell, cycle, n_tasks, flows, n_flows, out);
-        mark_cancelled(s, cell, cycle, first + n, n_tasks, flows, n_flows, out);
+        if (cell == cell_0) {
+          mark_cancelled(s, cell, cycle, first + n, n_tasks, flows, n_flows, out);
+        }
       }
       out = start_ns + n_tasks;
     }

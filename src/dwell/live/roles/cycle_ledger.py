@@ -644,7 +644,8 @@ class Ledger:
         `shadows` tells whether the result has the shadows' instants.
         """
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
-        self._mark_not_due(known, cycles)
+        for tables in (known, of_shadows):
+            self._mark_not_due(tables, cycles)
         through = np.full(len(cycles), -1, np.int64)
         for row, cycle in enumerate(cycles):
             if cycle.shadow in self._codes:
@@ -696,7 +697,7 @@ class Ledger:
         return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
 
     def _mark_not_due(self, known: Mapping[str, Ints], cycles: Sequence[LiveCycle]) -> None:
-        """Mark the jobs and messages of cycles in which they are not due."""
+        """Mark the jobs and messages of cycles, or shadows, in which they are not due."""
         if not self._pipeline.has_rates:
             return
         numbers = np.array([cycle.number for cycle in cycles], np.int64)
