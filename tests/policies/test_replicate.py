@@ -253,11 +253,11 @@ def test_bad_bases(base: str, message: str) -> None:
 
 
 def test_it_replicates_in_a_run_where_a_second_copy_pays() -> None:
-    cell = evolve(hedge(), {"controller.estimator": "corrected"})
-    scenario = "network-impairment-mild"
-    run = dwell.simulate(cell, scenario=scenario, policy="replicate", seed=1, windows=8)
-    assert "BOTH" in run.windows["placement"].to_list()
-    assert run.decisions["reason"].is_in(["dwell", "hold", "migrate"]).all()
+    settings = {"controller.estimator": "corrected", "controller.replicate.base": "LOC"}
+    cell = evolve(hedge(), settings)
+    run = dwell.simulate(cell, scenario="robot-cpu-stress", policy="replicate", seed=1, windows=8)
+    assert run.windows["placement"].to_list() == ["LOC"] * 4 + ["BOTH"] * 3
+    assert run.meta["parameters"]["base"]["policy"] == "Static"
 
 
 def test_with_a_high_price_of_the_robots_cpu_it_never_replicates() -> None:

@@ -217,7 +217,7 @@ class Arrays:
 #: Tables with rows by cell.
 BY_CELL = (
     *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome", "late_copies"),
-    *("actuated_ns", "actuated_from"),
+    *("paid", "actuated_ns", "actuated_from"),
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
 )
@@ -637,8 +637,10 @@ class _Layout:
     def _add_pairs(self, problem: Problem) -> None:
         """Add the roles of the tasks for a shadow, by pair of candidates."""
         for active, other in itertools.product(problem.candidates.values(), repeat=2):
-            parts = shadow_parts(problem.pipeline, active.first, other.first)
-            self.shadow_parts.append(parts + [ShadowPart.SHARED] * (self.max_tasks - len(parts)))
+            parts = shadow_parts(problem.pipeline, active, other.first)
+            # No shadow shares the jobs of second copies.
+            parts += [ShadowPart.DISCARDED] * (self.max_tasks - len(parts))
+            self.shadow_parts.append(parts)
 
     def _add_shadow(
         self, index: int, problem: Problem, real: Realisation, link_row: Mapping[str, int]
@@ -752,6 +754,7 @@ class _Layout:
             (task.name, task.name): task.state_bytes for task in problem.pipeline.tasks.values()
         }
         rows = self._addresses(real.delay_ns), real.loss_keys
+        links = problem.fabric.links
         for (source, target, link_name), delay_ns, loss_key in zip(
             (*real.hops, *real.forwards), *rows, strict=True
         ):
@@ -761,6 +764,7 @@ class _Layout:
                     "payload_bytes": payload[source, target],
                     "delay_ns": delay_ns,
                     "loss_key": loss_key,
+                    "price": payload[source, target] * links[link_name].price_per_byte,
                 }
             )
             self.layers.append({})
@@ -868,6 +872,7 @@ class _Layout:
             "actuated_from": (cells, chains, cycles),
             "shadow_bytes": (cells if self.shadows else 0, cycles),
             "log_outcome": logged * self.max_tasks,
+            "paid": (cells * any(problem.fabric.has_prices for problem, _ in self.cells), cycles),
             "late_copies": (cells * any(problem.replicas for problem, _ in self.cells), cycles),
         }
         lists: dict[str, list[Any]] = {
@@ -1006,11 +1011,11 @@ def flow_columns(problem: Problem) -> Ints:
     return np.concatenate([rows, rows + len(rows)]) if problem.replicas else rows
 
 
-def shadow_parts(pipeline: Pipeline, active: Copy, other: Copy) -> list[ShadowPart]:
+def shadow_parts(pipeline: Pipeline, active: Placement, other: Copy) -> list[ShadowPart]:
     """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 
-    A task is shadowed if it, or any task before it, runs on another node; a sink behind such tasks
-    discards its inputs. All other tasks are shared: their outputs are sent twice.
+    A task is shadowed if it, or any task before it, runs on another node or has two copies; a sink
+    behind such tasks discards its inputs. All other tasks are shared: their outputs are sent twice.
     """
     diverging = pipeline.diverging(active, other)
     return [

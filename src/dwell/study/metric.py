@@ -5,7 +5,7 @@ Terminal, pages, tables, intervals and docs use `METRICS`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -59,6 +59,8 @@ METRICS: Mapping[str, Metric] = {
         Metric(AGE_OF, "age of {chain}", "ms", wording="L95, mean of windows", values="median"),
         Metric(OVER_AGE_OF, "{chain} too old", "%", 100.0, wording="actuations", values="share"),
         Metric("seen_age_ms", "age in J", "ms", wording="mean of windows", values="positive"),
+        Metric("seen_price_per_hour", "price of bytes", "/h", decimals=4, values="positive"),
+        Metric("nodes_price_per_hour", "price of nodes", "/h", decimals=4, values="positive"),
         Metric("u_robot", "U_r", "%", 100.0, wording="busiest robot", values="positive"),
         Metric("u_edge", "U_e", "%", 100.0, wording="busiest edge node", values="positive"),
         Metric("migrations", "migrations", values="positive"),
@@ -97,6 +99,12 @@ METRICS: Mapping[str, Metric] = {
         Metric("j_still", "J without moves", decimals=2, values="positive"),
     )
 }
+
+
+def further_columns(chains: Iterable[str]) -> list[str]:
+    """Return the columns of ages and prices, which only some cells have."""
+    ages = [of.format(chain=name) for name in chains for of in (AGE_OF, OVER_AGE_OF)]
+    return [*ages, "seen_age_ms", "seen_price_per_hour", "nodes_price_per_hour"]
 
 
 def declared(column: str) -> Metric | None:
