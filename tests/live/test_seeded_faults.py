@@ -180,9 +180,9 @@ def takes_orders_of_any_term(patch: pytest.MonkeyPatch) -> None:
 def sends_everywhere(patch: pytest.MonkeyPatch) -> None:
     routes = Routes.destinations
 
-    def all_of_them(self: Routes, task: str, stamp: Any, *, shadow: bool = False) -> Any:
+    def all_of_them(self: Routes, task: str, stamp: Any, *node: str, shadow: bool = False) -> Any:
         for name in CANDIDATES:
-            yield from routes(self, task, replaced(stamp, placement=name), shadow=shadow)
+            yield from routes(self, task, replaced(stamp, placement=name), *node, shadow=shadow)
 
     patch.setattr(Routes, "destinations", all_of_them)
 
