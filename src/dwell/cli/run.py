@@ -32,7 +32,7 @@ from dwell.cli.output import file_name, print_json, warn, working
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, RunError
 from dwell.model.bounds import counted
-from dwell.model.table_columns import AGE_OF, OVER_AGE_OF, SHARE_OF, USE_OF
+from dwell.model.table_columns import OF_CHAINS, SHARE_OF, USE_OF
 from dwell.record.json_documents import read_document
 
 if TYPE_CHECKING:
@@ -213,9 +213,7 @@ def _numbers(problem: Problem, row: Row) -> str:
 
     shown = (name for name in SHOWN if values.get(name, 0) or name not in RARE)
     lines = {METRICS[name].title: METRICS[name].text(values[name]) for name in shown}
-    ages = [
-        of.format(chain=name) for name in problem.pipeline.chains for of in (AGE_OF, OVER_AGE_OF)
-    ]
+    ages = [of.format(chain=name) for name in problem.pipeline.chains for of in OF_CHAINS]
     aged = [metric_of(column) for column in (*ages, "seen_age_ms") if column in values]
     lines |= {metric.title: metric.text(values[metric.column]) for metric in aged}
     lines["windows by placement"] = listed(SHARE_OF, problem.candidates)

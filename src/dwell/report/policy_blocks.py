@@ -12,7 +12,7 @@ import numpy as np
 from dwell.display import Measure
 from dwell.model.bounds import counted
 from dwell.model.objective import AIM
-from dwell.model.table_columns import AGE_OF, OVER_AGE_OF, SHARE_OF, USE_OF
+from dwell.model.table_columns import OF_CHAINS, SHARE_OF, USE_OF
 from dwell.policies.registry import estimator_of
 from dwell.report.charts import (
     NO_LIMIT,
@@ -318,7 +318,7 @@ class PolicyBlocks:
         """Return further numbers of every policy in every scenario."""
         used = [USE_OF.format(resource=name) for name in self.problem.fabric.resources]
         chains = self.problem.pipeline.chains
-        ages = [of.format(chain=name) for name in chains for of in (AGE_OF, OVER_AGE_OF)]
+        ages = [of.format(chain=name) for name in chains for of in OF_CHAINS]
         known = (*MORE, *ages, "seen_age_ms", *used, *self.found.metrics)
         metrics = [metric_of(column) for column in known if column in self.runs.columns]
         return Table(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dwell.display import Measure, decimals_for, write_number
 from dwell.model.bounds import counted
-from dwell.model.table_columns import AGE_OF, OVER_AGE_OF
+from dwell.model.table_columns import OF_CHAINS
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES, shown_reason
 from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
@@ -147,7 +147,7 @@ class _RunPage:
             metric = METRICS[column]
             yield Fact(metric.title, metric.text(row[column]), remark, word)
         chains = self.header.problem.pipeline.chains
-        ages = [of.format(chain=name) for name in chains for of in (AGE_OF, OVER_AGE_OF)]
+        ages = [of.format(chain=name) for name in chains for of in OF_CHAINS]
         for metric in map(metric_of, (*ages, "seen_age_ms")):
             if metric.column in row:
                 yield Fact(metric.title, metric.text(row[metric.column]), "")

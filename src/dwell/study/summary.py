@@ -35,7 +35,7 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints, Mask
 from dwell.model.order_statistic import rank_of
 from dwell.model.stretches import misses_in
-from dwell.model.table_columns import AGE_OF, OVER_AGE_OF, SHARE_OF, USE_OF
+from dwell.model.table_columns import OF_CHAINS, SHARE_OF, USE_OF
 from dwell.record.moves import by_guard
 from dwell.study.quality import actuations, age_of_information, track
 
@@ -260,10 +260,8 @@ def _answer(windows: TableArrays, counts: Mask, missed: Mask) -> dict[str, float
 
 
 def _ages(windows: TableArrays, counts: Mask, problem: Problem) -> dict[str, float]:
-    """Return means over windows: L95 and misses of chains, and the mean age if J weighs it."""
-    templates = (AGE_OF, OVER_AGE_OF)
-    chains = problem.pipeline.chains
-    columns = [template.format(chain=name) for name in chains for template in templates]
+    """Return means over windows: the columns of chains, and the mean age if J weighs it."""
+    columns = [of.format(chain=name) for name in problem.pipeline.chains for of in OF_CHAINS]
     if problem.objective.weighs_age:
         columns.append("seen_age_ms")
     return {column: mean_of(windows[column][counts]) for column in columns}
