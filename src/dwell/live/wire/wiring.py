@@ -189,7 +189,6 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
-    _require_latencies(problem)
     _require_no_replicas(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
@@ -344,20 +343,6 @@ def require_candidates(problem: Problem) -> None:
         message = f"not supported in the live cell {problem.name}"
         remedy = "paste the block of `dwell candidates CELL --yaml`"
         raise ProblemError([Fault("candidates.all", f"{message}; {remedy}")])
-
-
-def _require_latencies(problem: Problem) -> None:
-    """Raise a LiveError if J needs ages, which live windows do not have."""
-    objective = problem.objective
-    keys = {"latency": objective.latency is not None, "weights.age": objective.weighs_age}
-    lines = [
-        f"objective.{key}: not supported in the live cell {problem.name}; only the simulator "
-        "measures ages: remove it, or use dwell run"
-        for key, there in keys.items()
-        if there
-    ]
-    if lines:
-        raise LiveError("\n".join(lines))
 
 
 def _require_no_replicas(problem: Problem) -> None:
