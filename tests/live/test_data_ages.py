@@ -10,18 +10,22 @@ import polars as pl
 import polars.testing
 import pytest
 
-from dwell.model import Chain, Problem, Targets, Weights
+from dwell.model import Caps, Chain, MissCap, Problem, Targets, Weights
 from tests.live.rated_cells import SLOW, sampling, world_of
 from tests.live.replayed import SYNCHRONOUS, Clocks, messages_of, recorded, replay, simulate
 from tests.live.small_world import Staying, canonical, columns
 
 
 def aged(problem: Problem, latency: str | None) -> Problem:
-    """Let a cell weigh its mean age; it has a chain, whose age may count as latency."""
+    """Let a cell weigh its mean age, and cap its misses; the age of a chain may be its latency."""
     chains = problem.pipeline.chains or {"see": Chain("sensing", "control", 150)}
     targets = Targets(latency_ms=100, age_ms=60.0)
     objective = replace(
-        problem.objective, weights=Weights(age=1.0), targets=targets, latency=latency
+        problem.objective,
+        weights=Weights(age=1.0),
+        targets=targets,
+        latency=latency,
+        caps=Caps(misses=MissCap(1, 20)),
     )
     return replace(problem, pipeline=replace(problem.pipeline, chains=chains), objective=objective)
 
@@ -37,19 +41,20 @@ def test_a_simulated_run_with_ages_in_j_is_decided_on_in_the_same_way_live(
     cell = canonical(
         20, decide_cycles=every, estimator="tests.live.replayed:Dated", initial=initial, **settings
     )
-    played = simulate(aged(cell, latency), "robot-cpu-stress", windows=15, seed=seed)
+    windows = 15 if every == 20 else 6
+    played = simulate(aged(cell, latency), "robot-cpu-stress", windows=windows, seed=seed)
     _, controller, _, _, rows = replay(played, SYNCHRONOUS, messages_of(played, Clocks()))
     live, simulated = recorded(tmp_path, controller, rows), played.run
     count = live.decisions.height
     assert count >= simulated.decisions.height - 1 > 10
-    assert {"est_age_ms_LOC", "seen_age_ms"} <= {*live.decisions.columns}
+    assert {"est_age_ms_LOC", "est_misses_LOC", "seen_age_ms"} <= {*live.decisions.columns}
     names = [name for name in simulated.decisions.columns if name in live.decisions.columns]
     pl.testing.assert_frame_equal(
         live.decisions.select(names), simulated.decisions.select(names)[:count], abs_tol=1e-6
     )
-    windows = simulated.windows[: live.windows.height]
-    names = [name for name in windows.columns if not name.startswith("shadow_")]
-    pl.testing.assert_frame_equal(live.windows.select(names), windows.select(names), abs_tol=1e-6)
+    known = simulated.windows[: live.windows.height]
+    names = [name for name in known.columns if not name.startswith("shadow_")]
+    pl.testing.assert_frame_equal(live.windows.select(names), known.select(names), abs_tol=1e-6)
     cycles = [name for name in simulated.cycles.columns if name.startswith("chain_")]
     assert len(cycles) == 2 * (latency is not None)
     known = simulated.cycles[: live.cycles.height].select("missed", *cycles)

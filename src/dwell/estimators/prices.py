@@ -29,7 +29,7 @@ from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
 from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import CycleOutcome
-from dwell.kernels.over_age import over_age
+from dwell.kernels.over_age import due_misses
 from dwell.kernels.random_draws import Drawing
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
@@ -216,7 +216,9 @@ def _answer(question: Question) -> Mapping[str, Price]:
     loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
     least_cycles = slow.least_cycles(problem.pipeline.period_ms)
     if question.misses is not None:
-        least_cycles = max(least_cycles, question.misses.least_cycles)
+        least_cycles = max(
+            least_cycles, question.misses.least_cycles * problem.pipeline.due_interval
+        )
     least = SETTLING + math.ceil(least_cycles / problem.window_cycles)
     windows = min(_first_windows(problem, question.scenario), most)
     if question.misses is not None:
@@ -338,17 +340,15 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         l95_deviation_ms=_deviation(windows_ms, l95_error_ms),
         violation_deviation=_deviation(rates, violation_error),
         age=_age(player, name, windows, is_last=is_last) if problem.objective.weighs_age else None,
-        misses=None if cap is None else share_over(_missed(player, arrays, since)[~is_idle], cap),
+        misses=None if cap is None else share_over(_missed(player, arrays, since), cap),
     )
 
 
 def _missed(player: CandidatePlayer, arrays: Arrays, since: int) -> NDArray[np.bool_]:
-    """Return whether each cycle from `since` on is late, or its data are too old."""
+    """Return whether each cycle with a due sink, from `since` on, has missed."""
     ((problem, realisation),) = player.cells
-    late = arrays.tables.latency_ns[0, since:] > problem.pipeline.deadline_ns
     played = problem.pipeline, realisation.release_ns, CellArrays(arrays)
-    missed: NDArray[np.bool_] = late | over_age(*played, slice(since, realisation.cycles))
-    return missed
+    return due_misses(*played, slice(since, realisation.cycles))
 
 
 def _age(
