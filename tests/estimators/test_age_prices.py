@@ -53,7 +53,22 @@ def test_a_price_equals_a_static_run_on_the_same_realisation(latency: str | None
         assert found.age is not None
         assert found.age[0] == pytest.approx(windows["seen_age_ms"].mean(), rel=1e-12)
         if latency is not None:
-            assert found.uncut_l95_ms >= found.l95_ms
+            age_ms = windows["age_l95_see-act"].mean()
+            assert found.uncut_l95_ms == pytest.approx(age_ms, rel=1e-3)
+
+
+def test_an_age_above_the_bound_for_j_is_over_the_cap() -> None:
+    problem = with_ages(dwell.load("examples/inner-loop.yaml"))
+    chains = {"see-act": Chain("camera", "control", 20)}
+    objective = replace(problem.objective, caps=Caps(latency_ms=100))
+    problem = replace(
+        problem, pipeline=replace(problem.pipeline, chains=chains), objective=objective
+    )
+    # The age is about 153 ms; J counts 100 ms.
+    price = prices_of(problem)["EDGE"]
+    assert price.l95_ms == problem.censor_ms == 100
+    assert price.uncut_l95_ms > 140
+    assert excess(price.qos, problem.objective) > 0.4
 
 
 def test_what_an_objective_measures_is_part_of_a_prices_key() -> None:

@@ -465,12 +465,13 @@ def _tight(
 
 def _l95_ms(problem: Problem, profile: Profile, latency: str | None) -> Mapping[str, float]:
     """Return L95 of each candidate undisturbed: of a chain's age, or of cycles."""
-    if latency == problem.objective.latency:
-        return profile.l95_ms
-    # Any chain is frequent enough for decisions once per window.
-    controller = replace(problem.controller, decide_cycles=problem.window_cycles)
-    objective = replace(problem.objective, latency=latency)
-    return Profile(replace(problem, objective=objective, controller=controller)).l95_ms
+    if latency != problem.objective.latency:
+        # Any chain is frequent enough for decisions once per window.
+        controller = replace(problem.controller, decide_cycles=problem.window_cycles)
+        objective = replace(problem.objective, latency=latency)
+        profile = Profile(replace(problem, objective=objective, controller=controller))
+    # The bound on an age in J may be below the guard's patience for the chain.
+    return profile.l95_ms if latency is None else profile.uncut_l95_ms
 
 
 def _return_ms(problem: Problem, candidate: str, ends: Iterable[str]) -> float:
