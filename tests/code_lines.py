@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 27_951, "live": 16_136, "lab": 6_819}
+MOST = {"simulator": 28_153, "live": 16_146, "lab": 6_819}
 
 
 def code_lines(text: str) -> int:

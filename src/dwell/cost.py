@@ -4,12 +4,14 @@ J weighs the four metrics of a window, each relative to its design target, and t
 that moved::
 
     J = a_L * L95 / L_target + a_V * V_D + a_r * U_r / U_r_target + a_e * U_e / U_e_target
-        [+ a_c * U_c / U_c_target] [+ a_a * age / age_target] + a_S * S
+        [+ a_c * U_c / U_c_target] [+ a_a * age / age_target] [+ a_p * price / price_target]
+        + a_S * S
 
 U_r and U_e are maxima over the tier's nodes, because a mean hides a single saturated robot. They
 include accelerators if the objective counts them. The bracketed terms exist only if the objective
-weighs cloud nodes separately (otherwise cloud nodes count as edge nodes), or weighs the mean age of
-the newest command. L95 is of the data age of a chain if the objective names one.
+weighs cloud nodes separately (otherwise cloud nodes count as edge nodes), the mean age of the
+newest command, or the price of transmitted bytes. L95 is of the data age of a chain if the
+objective names one.
 
 All arithmetic is in `price`, which takes floats and arrays: one window and an array of thousands
 give the same bits.
@@ -53,6 +55,7 @@ __all__ = [
     "tier_nodes",
     "tier_utilisation",
     "weighed_age_ms",
+    "weighed_price",
 ]
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
@@ -170,6 +173,7 @@ def price(
     switching: Metric | float,
     objective: Objective,
     age_ms: Metric | float = 0.0,
+    price_per_hour: Metric | float = 0.0,
 ) -> Metric:
     """Return J of metrics given as floats or arrays, elementwise (paper, eq. 5 and 7).
 
@@ -187,6 +191,8 @@ def price(
         S, the share of tasks moved.
     age_ms : float or array
         Mean age, milliseconds; ignored unless ``objective.weights.age`` is above 0.
+    price_per_hour : float or array
+        Price of transmitted bytes; ignored unless ``objective.weights.price`` is above 0.
 
     Returns
     -------
@@ -204,6 +210,8 @@ def price(
         J = J + weights.cloud * (cloud / targets.cloud)
     if weights.age and targets.age_ms is not None:
         J = J + weights.age * (age_ms / targets.age_ms)
+    if weights.price and targets.price_per_hour is not None:
+        J = J + weights.price * (price_per_hour / targets.price_per_hour)
     return J + weights.switching * switching
 
 
@@ -225,16 +233,16 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
     Raises
     ------
     MetricError
-        If the utilisation of a node of ``objective.tiers``, or a weighed age, is missing, or J is
-        not finite.
+        If the utilisation of a node of ``objective.tiers``, or a weighed age or price, is missing,
+        or J is not finite.
     PlacementError
         If the placements cover different tasks.
     """
     robot, edge, cloud = tier_utilisation(qos.utilisation, objective)
     switching = hamming(current, previous)
-    age_ms = weighed_age_ms(qos, objective)
+    weighed = weighed_age_ms(qos, objective), weighed_price(qos, objective)
     rate = qos.violation_rate
-    J = float(price(qos.l95_ms, rate, robot, edge, cloud, switching, objective, age_ms))
+    J = float(price(qos.l95_ms, rate, robot, edge, cloud, switching, objective, *weighed))
     if not math.isfinite(J):
         raise MetricError(f"J is {J!r} for {qos}; a metric is too large for its weight and target")
     return J
@@ -252,13 +260,26 @@ def weighed_age_ms(qos: QoS, objective: Objective) -> float:
     return qos.age_ms
 
 
+def weighed_price(qos: QoS, objective: Objective) -> float:
+    """Return the price per hour of a QoS as J needs it: 0 if J has no term of it.
+
+    Raises MetricError if it is missing.
+    """
+    if not objective.weighs_price:
+        return 0.0
+    if qos.price_per_hour is None:
+        raise MetricError("price_per_hour is missing; J needs it where weights.price is above 0")
+    return qos.price_per_hour
+
+
 def cost_error(
     error: tuple[float, float] | None, objective: Objective, age_error_ms: float = 0.0
 ) -> float:
     """Return the standard error of an estimate's J from the errors of its metrics (see `QoS`).
 
     The terms are added, not combined in quadrature: L95, V_D and the age come from the same cycles
-    and err in the same direction. The sum is the largest error that any correlation gives.
+    and err in the same direction. The sum is the largest error that any correlation gives. The
+    price of bytes counts as exact: messages are sent at a fixed rate.
     """
     if error is None:
         return 0.0

@@ -57,6 +57,7 @@ nodes:
     background_beside: 0.05
     background_hz: 50
     interference: 1.1
+    price_per_hour: 2
   E: {tier: cloud, cores: 2, scheduler: fifo}
 links:
   - from: R
@@ -66,6 +67,7 @@ links:
     loss: 0.01
     on_loss: {retransmit_ms: 20}
     in_order: true
+    price_per_gb: 0.5
     bursts: {every_ms: 800, for_ms: 4, add_delay_ms: 2}
   - {from: E, to: R, delay_ms: 1}
 tasks:
@@ -106,8 +108,15 @@ chains: {see-act: {from: see, to: act, max_age_ms: 90}}
 candidates: {LOC: {think: R}, FAR: {think: E}}
 objective:
   weights:
-    {latency: 1.5, violations: 2, robot: 0.6, edge: 0.4, switching: 0.3, cloud: 0.2, age: 0.1}
-  targets: {latency_ms: 80, robot: 0.6, edge: 0.5, cloud: 0.4, age_ms: 70}
+    latency: 1.5
+    violations: 2
+    robot: 0.6
+    edge: 0.4
+    switching: 0.3
+    cloud: 0.2
+    age: 0.1
+    price: 0.3
+  targets: {latency_ms: 80, robot: 0.6, edge: 0.5, cloud: 0.4, age_ms: 70, price_per_hour: 2}
   caps: {latency_ms: 95, utilisation: 0.9, misses: {m: 2, k: 20}}
   latency: see-act
   tiers: {R: robot}

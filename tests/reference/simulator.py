@@ -156,6 +156,15 @@ class Decision:
 
 
 @dataclass(frozen=True)
+class Transmission:
+    """A transmission of a link: when the message was handed to the link, and its bytes."""
+
+    at_ns: int
+    link: str
+    payload_bytes: int
+
+
+@dataclass(frozen=True)
 class Result:
     """The record of a run.
 
@@ -167,7 +176,8 @@ class Result:
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
     with each other (see `closest_unrelated`); None where there is no such pair. `late` counts the
     messages of each cycle that came after the other copy's. Jobs of second copies have the name
-    `second(task)`, and so have both ends of their messages.
+    `second(task)`, and so have both ends of their messages. `transmitted` has each transmission of
+    a link.
     """
 
     cycles: tuple[CycleResult, ...]
@@ -180,6 +190,7 @@ class Result:
     decisions: tuple[Decision, ...]
     closest_ns: int | None
     late: Mapping[int, int] = field(default_factory=dict)
+    transmitted: Sequence[Transmission] = ()
 
     @property
     def busy(self) -> Mapping[str, tuple[Fraction, ...]]:
@@ -804,6 +815,7 @@ class Simulation:
         self.first = 0
         self.over = False
         self.opened: dict[int, dict[str, Usage]] = {}
+        self.transmitted: list[Transmission] = []
         self.windows: list[WindowResult] = []
         self.looks: list[Look] = []
         self.every = problem.decide_cycles
@@ -1045,6 +1057,7 @@ class Simulation:
             decisions=tuple(self.decisions),
             closest_ns=closest_unrelated(self.log),
             late=self.copies.late,
+            transmitted=tuple(self.transmitted),
         )
 
     def results(self, cell: int) -> dict[tuple[int, str], JobResult]:
@@ -2008,6 +2021,7 @@ class Simulation:
             if link.in_order and message not in self.ordered[name]:
                 self.ordered[name].append(message)
             duration = transmission_ns(message.payload_bytes, state.rate_mbps)
+            self.transmitted.append(Transmission(message.sent_at, name, message.payload_bytes))
             key = message.draws.loss_key
             if attempt_uniform(key, message.cycle, message.attempt) >= state.loss:
                 self.propagate(name, message, state, duration, begun)

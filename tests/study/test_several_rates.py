@@ -1,4 +1,4 @@
-"""Example cells with several rates: their pages show what their scripts print."""
+"""Example cells with several rates or prices: their pages show what their scripts print."""
 
 from __future__ import annotations
 
@@ -13,8 +13,13 @@ from dwell.study import compare
 from tests.cli.small_cell import call, read_json
 
 ROOT = Path(__file__).parents[2]
-#: Cells that have a page.
-CELLS = ("inner-loop", "chunks", "autoware")
+#: Pages and their cells.
+CELLS = {
+    "inner-loop": "inner-loop",
+    "chunks": "chunks",
+    "autoware": "autoware",
+    "clouds": "cloud-chunks",
+}
 
 
 def block(name: str, language: str) -> str:
@@ -33,7 +38,7 @@ def test_a_page_shows_what_its_script_prints(
     assert capsys.readouterr().out == block(name, "text")
 
 
-@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("name", CELLS.values())
 def test_a_cell_has_no_faults_and_no_warnings(name: str) -> None:
     found = read_json(call("check", ROOT / "examples" / f"{name}.yaml", "--json"))
     assert found["valid"] is True

@@ -11,6 +11,7 @@ import typer
 import dwell
 from dwell.cli.options import CellArgument, Json, Scenario, Seed, Traces, flag, option
 from dwell.cli.output import aligned, print_json, with_error
+from dwell.cli.placement_prices import placement_prices
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ def _contents(
                 "violation_rate": one.qos.violation_rate,
                 "errors": one.qos.error,
                 "utilisation": dict(one.qos.utilisation),
+                **placement_prices(problem, one.placement, one.qos.price_per_hour),
             }
             for name, one in zip(called, ranking.best, strict=True)
         },
@@ -134,6 +136,7 @@ def _summary(
     for name, one in zip(called, ranking.best, strict=True):
         l95_error, rate_error = one.qos.error or (0.0, 0.0)
         error = cost_error(one.qos.error, problem.objective)
+        money = placement_prices(problem, one.placement, one.qos.price_per_hour)
         rows.append(
             [
                 name,
@@ -141,6 +144,7 @@ def _summary(
                 with_error(f"{one.qos.l95_ms:.1f}", l95_error),
                 with_error(f"{one.qos.violation_rate * 100:.2f}", rate_error * 100),
                 *(f"{one.qos.utilisation[resource] * 100:.0f}" for resource in resources),
+                *(METRICS[column].number(value) for column, value in money.items()),
             ]
         )
     head = [
@@ -149,6 +153,7 @@ def _summary(
         l95.heading,
         rate.heading,
         *(f"U of {r} (%)" for r in resources),
+        *(METRICS[column].heading for column in money),
     ]
     yield aligned(head, rows)
     yield ""

@@ -13,6 +13,7 @@ import dwell
 from dwell.cli.completion import nodes
 from dwell.cli.options import CellArgument, Insecure, Json, Keys, Scenario, Traces
 from dwell.cli.output import aligned, print_json, warn, with_error
+from dwell.cli.placement_prices import placement_prices
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
@@ -167,6 +168,7 @@ def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
             "own_work": dict(prices[name].own),
             "cycles": prices[name].cycles,
             "is_settled": prices[name].is_settled,
+            **placement_prices(problem, placement, prices[name].price_per_hour),
         }
         for name, placement in problem.candidates.items()
     }
@@ -184,13 +186,20 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
     ]
     what = "node" if len(resources) == len(nodes) else "node and accelerator"
     l95, rate = METRICS["l95_ms"], METRICS["violation_rate"]
-    head = ["candidate", l95.heading, rate.heading, *(f"{one} (%)" for one in resources)]
+    money = {
+        name: placement_prices(problem, placement, prices[name].price_per_hour)
+        for name, placement in problem.candidates.items()
+    }
+    priced = [METRICS[column] for column in next(iter(money.values()))]
+    used = [f"{one} (%)" for one in resources]
+    head = ["candidate", l95.heading, rate.heading, *used, *(one.heading for one in priced)]
     rows = [
         [
             name,
             with_error(milliseconds(price.l95_ms), price.l95_error_ms),
             with_error(rate.number(price.violation_rate), price.violation_error * 100),
             *(f"{price.own[one] * 100:.0f}" for one in resources),
+            *(metric.number(money[name][metric.column]) for metric in priced),
         ]
         for name, price in prices.items()
     ]

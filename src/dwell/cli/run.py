@@ -32,7 +32,7 @@ from dwell.cli.output import file_name, print_json, warn, working
 from dwell.display import milliseconds
 from dwell.errors import ExitCode, RunError
 from dwell.model.bounds import counted
-from dwell.model.table_columns import OF_CHAINS, SHARE_OF, USE_OF
+from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.record.json_documents import read_document
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ def _never_moving(placements: Mapping[str, Mapping[str, float]], problem: Proble
 
 
 def _numbers(problem: Problem, row: Row) -> str:
-    from dwell.study.metric import METRICS, metric_of
+    from dwell.study.metric import METRICS, further_columns, metric_of
 
     values = {name: value for name, value in row.items() if not isinstance(value, str)}
 
@@ -213,9 +213,9 @@ def _numbers(problem: Problem, row: Row) -> str:
 
     shown = (name for name in SHOWN if values.get(name, 0) or name not in RARE)
     lines = {METRICS[name].title: METRICS[name].text(values[name]) for name in shown}
-    ages = [of.format(chain=name) for name in problem.pipeline.chains for of in OF_CHAINS]
-    aged = [metric_of(column) for column in (*ages, "seen_age_ms") if column in values]
-    lines |= {metric.title: metric.text(values[metric.column]) for metric in aged}
+    columns = further_columns(problem.pipeline.chains)
+    further = [metric_of(column) for column in columns if column in values]
+    lines |= {metric.title: metric.text(values[metric.column]) for metric in further}
     lines["windows by placement"] = listed(SHARE_OF, problem.candidates)
     lines["utilisation"] = listed(USE_OF, problem.fabric.resources)
     width = max(map(len, lines))

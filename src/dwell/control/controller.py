@@ -265,6 +265,7 @@ class Controller:
             "fleet": self.coordination is not None,
             "between": self._has_looks,
             "age": self.problem.objective.weighs_age,
+            "price": self.problem.fabric.has_prices,
             "misses": self.objective.caps.misses is not None,
         }
         return tuple(feature for feature, there in has.items() if there)
@@ -366,6 +367,7 @@ class Controller:
         shares: Floats,
         recent: Floats | None = None,
         age_ms: float | None = None,
+        price_per_hour: float | None = None,
     ) -> Proposal:
         """Propose from the metrics of a window that the engine has computed (see `propose`).
 
@@ -380,8 +382,10 @@ class Controller:
             The same shares since the last decision, for the estimator; None for `shares`.
         age_ms : float, optional
             Mean age of the newest command; needed if J weighs it.
+        price_per_hour : float, optional
+            Price of transmitted bytes; needed if J weighs it.
         """
-        seen = l95_ms, violation_rate, uncut_ms, age_ms
+        seen = l95_ms, violation_rate, uncut_ms, age_ms, price_per_hour
         observed = self._observed(*seen, shares)
         if recent is None:
             return self.propose_by(observed, self._own_shares(shares))
@@ -394,13 +398,15 @@ class Controller:
         violation_rate: float,
         uncut_ms: float,
         age_ms: float | None,
+        price_per_hour: float | None,
         shares: Floats,
     ) -> QoS:
         """Return the metrics with the busy share of each resource."""
         used = dict(zip(self.resources, shares[0].tolist(), strict=True))
         if self._has_accelerators:
             used = _measured(used)
-        return QoS(l95_ms, violation_rate, FrozenDict(used), uncut_ms, age_ms=age_ms)
+        known = l95_ms, violation_rate, FrozenDict(used), uncut_ms
+        return QoS(*known, age_ms=age_ms, price_per_hour=price_per_hour)
 
     def _own_shares(self, shares: Floats) -> dict[str, float]:
         """Return the share of each resource that is not foreign."""
@@ -687,12 +693,14 @@ class Controller:
         self.decisions.append((*fixed, *cycles, dwell_cycles, *proposal.priced, *asked, why))
 
     def _looked_at(self, observed: QoS) -> tuple[float | None, ...]:
-        """Return the metrics of a decision, if a window can have several, and a weighed age."""
-        age_ms = (observed.age_ms,) if self.problem.objective.weighs_age else ()
+        """Return the metrics of a decision, if a window can have several, and its weighed terms."""
+        further = (observed.age_ms,) if self.problem.objective.weighs_age else ()
+        if self.problem.fabric.has_prices:
+            further = (*further, observed.price_per_hour)
         if not self._has_looks:
-            return age_ms
+            return further
         used = map(observed.utilisation.get, self.resources)
-        return observed.l95_ms, observed.violation_rate, *used, *age_ms
+        return observed.l95_ms, observed.violation_rate, *used, *further
 
     def _priced(self, decision: Decision, estimates: Mapping[str, QoS]) -> tuple[object, ...]:
         """Return the values of all candidates for a row of ``decisions``."""
@@ -707,6 +715,7 @@ class Controller:
             *[l95_ms for l95_ms, _ in errors],
             *[violation_rate for _, violation_rate in errors],
             *([estimate.age_ms for estimate in known] if self.problem.objective.weighs_age else ()),
+            *([one.price_per_hour for one in known] if self.problem.fabric.has_prices else ()),
             *([estimate.misses for estimate in known] if self.objective.caps.misses else ()),
             *[shares.get(name) for name in self.resources for shares in used],
             *self._capped(known),

@@ -51,7 +51,7 @@ def plain_rule(controller: Controller) -> PlainRule | None:
 
     The kernel needs one of the policies in `_KNOWN` and the estimator `Profile`, subclasses
     excluded. The policy must use the candidates of the problem, and its objective, if any. The
-    objective has neither ages nor a cap on misses.
+    objective has neither ages nor a cap on misses, and links have no prices.
     """
     problem, policy, profile = controller.problem, controller.policy, controller.estimator
     called, numbers = _KNOWN.get(type(policy), ("", None))
@@ -61,6 +61,8 @@ def plain_rule(controller: Controller) -> PlainRule | None:
     if list(own.candidates.items()) != list(problem.candidates.items()):
         return None
     if own.objective not in (None, problem.objective) or problem.objective.beyond_cycles:
+        return None
+    if problem.fabric.has_prices:
         return None
     names, placed = list(problem.candidates), list(own.candidates.values())
     resources = list(problem.fabric.resources)

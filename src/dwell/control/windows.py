@@ -228,16 +228,17 @@ def seen_costs(
     used: Mapping[str, Floats],
     switching: Floats,
     age_ms: Floats | float = 0.0,
+    price_per_hour: Floats | float = 0.0,
 ) -> Floats:
     """Return J of windows.
 
     Parameters
     ----------
-    l95_ms, violation_rate, switching, age_ms : float64 array, shape (windows,)
+    l95_ms, violation_rate, switching, age_ms, price_per_hour : float64 array, shape (windows,)
         `switching` is the sum of S over the moves that took effect in each window.
     used : mapping of str to float64 array, shape (windows,)
         Busy share of each resource.
     """
-    robot, edge, cloud = busiest(used, problem)
-    objective = problem.objective
-    return price(l95_ms, violation_rate, robot, edge, cloud, switching, objective, age_ms)
+    used_by_tier, objective = busiest(used, problem), problem.objective
+    weighed = age_ms, price_per_hour
+    return price(l95_ms, violation_rate, *used_by_tier, switching, objective, *weighed)

@@ -59,6 +59,7 @@ def cell_document(problem: Problem) -> Plain:
         "window_cycles": problem.window_cycles,
         "dwell_cycles": problem.dwell_cycles,
         "weighs_age": problem.objective.weighs_age,
+        "weighs_price": problem.objective.weighs_price,
         "nodes": [
             {"name": node.name, "tier": node.tier, "cores": node.cores}
             for node in fabric.nodes.values()

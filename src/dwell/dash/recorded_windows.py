@@ -22,6 +22,7 @@ SEEN = {
     "violation_rate": "seen_violation_rate",
     "cost": "cost",
     "age_ms": "seen_age_ms",
+    "price_per_hour": "seen_price_per_hour",
 }
 #: Explanation of the reason of a move to the least bad of all candidates.
 INFEASIBLE = "all candidates are over a cap, this one least"
@@ -196,6 +197,7 @@ class RecordedWindows:
             "l95_ms": f"est_l95_ms_{name}",
             "violation_rate": f"est_violation_rate_{name}",
             "age_ms": f"est_age_ms_{name}",
+            "price_per_hour": f"est_price_per_hour_{name}",
         }
         known = {key: column for key, column in estimates.items() if column in self.decisions}
         values = self._numbers(row, *known.values())

@@ -24,6 +24,7 @@ class Measured:
     l95_ms: Floats
     violation_rate: Floats
     utilisation: Mapping[str, float]
+    price_per_hour: float
 
     @property
     def qos(self) -> QoS:
@@ -32,7 +33,8 @@ class Measured:
             mean_and_error, (self.l95_ms, self.violation_rate)
         )
         error = (l95_error, rate_error) if len(self.l95_ms) > 1 else None
-        return QoS(l95_ms, rate, self.utilisation, error=error)
+        known = l95_ms, rate, self.utilisation
+        return QoS(*known, error=error, price_per_hour=self.price_per_hour)
 
 
 class AnyPlacement:
@@ -77,4 +79,5 @@ class AnyPlacement:
             l95_ms=windows.l95_ms.copy(),
             violation_rate=windows.violation_rate,
             utilisation=FrozenDict(zip(resources, used.round(12).tolist(), strict=True)),
+            price_per_hour=float(windows.price_per_hour.mean().round(12)),
         )

@@ -50,6 +50,11 @@ class PlayedWindows(NamedTuple):
         return self.seen["age_ms"]
 
     @property
+    def price_per_hour(self) -> Floats:
+        """Price of transmitted bytes; 0 without prices."""
+        return self.seen["price_per_hour"]
+
+    @property
     def missed(self) -> Ints:
         """Number of cycles that missed the deadline."""
         return self.seen["missed"]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dwell.cost import price, tier_nodes, weighed_age_ms
+from dwell.cost import price, tier_nodes, weighed_age_ms, weighed_price
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
@@ -41,8 +41,8 @@ class CellTerms:
         """J without switching and shared nodes."""
         robot, edge, cloud = (_most(names, qos.utilisation) for names in self._own)
         rate, objective = qos.violation_rate, self._objective
-        age_ms = weighed_age_ms(qos, objective)
-        return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective, age_ms))
+        weighed = weighed_age_ms(qos, objective), weighed_price(qos, objective)
+        return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective, *weighed))
 
     def of_one(self) -> dict[str, float]:
         """Return the cost to the cell of one busy core, or place, of each shared resource."""

@@ -46,6 +46,8 @@ class Declared:
     violation_rate: Mapping[str, Floats]
     #: Mean age of every window, by candidate; 0 unless J weighs it.
     age_ms: Mapping[str, Floats]
+    #: Price of transmitted bytes of every window, by candidate; 0 without prices.
+    price_per_hour: Mapping[str, Floats]
     #: The simulated shadow jobs, if they slow any candidate down.
     shadows: SentShadows | None = None
 
@@ -72,17 +74,24 @@ def _played(question: Question) -> Declared:
         player = CandidatePlayer([(problem, plain.realisation)], shadows=shadows)
         # Shadow jobs delay only these candidates.
         slowed = _shown(player, [n for n, of in question.shadow_fractions.items() if of])
-        known = plain.l95_ms, plain.violation_rate, plain.age_ms
-        l95_ms, rates, age_ms = (
+        known = plain.l95_ms, plain.violation_rate, plain.age_ms, plain.price_per_hour
+        l95_ms, rates, age_ms, per_hour = (
             FrozenDict({**one, **other}) for one, other in zip(known, slowed, strict=True)
         )
-        return replace(plain, l95_ms=l95_ms, violation_rate=rates, age_ms=age_ms, shadows=shadows)
+        return replace(
+            plain,
+            l95_ms=l95_ms,
+            violation_rate=rates,
+            age_ms=age_ms,
+            price_per_hour=per_hour,
+            shadows=shadows,
+        )
     windows = max(-(-DRAWN // problem.window_cycles), FEWEST)
     real = _drawn_as_declared(problem, question.seed, windows)
     shown = _shown(CandidatePlayer([(problem, real)]), problem.candidates)
     references = _references(problem, question.seed, windows)
-    l95_ms, rates, age_ms = map(FrozenDict, shown)
-    return Declared(real, FrozenDict(references), l95_ms, rates, age_ms)
+    l95_ms, rates, age_ms, per_hour = map(FrozenDict, shown)
+    return Declared(real, FrozenDict(references), l95_ms, rates, age_ms, per_hour)
 
 
 def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Reference]:
@@ -114,15 +123,14 @@ def _drawn_as_declared(problem: Problem, seed: int, windows: int) -> Realisation
     return Drawing(problem, "baseline", seed=seed, windows=windows, wraps=True).take(windows)
 
 
-def _shown(
-    player: CandidatePlayer, names: Iterable[str]
-) -> tuple[dict[str, Floats], dict[str, Floats], dict[str, Floats]]:
-    """Return L95 (ms), V_D and the mean age (ms) of every window, by candidate."""
+def _shown(player: CandidatePlayer, names: Iterable[str]) -> tuple[dict[str, Floats], ...]:
+    """Return L95 (ms), V_D, mean age (ms) and price per hour of every window, by candidate."""
     shown = {name: player.windows(player.play({0: name})) for name in names}
     return (
         {name: windows.l95_ms.copy() for name, windows in shown.items()},
         {name: windows.violation_rate for name, windows in shown.items()},
         {name: windows.age_ms.copy() for name, windows in shown.items()},
+        {name: windows.price_per_hour.copy() for name, windows in shown.items()},
     )
 
 

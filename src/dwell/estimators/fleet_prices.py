@@ -223,8 +223,9 @@ class FleetPrices:
         uncut_ms = float(played.uncut_ms.mean())
         shares = self._used(arrays, i).items()
         used = FrozenDict((name, share) for name, share in shares if name not in terms.of_shared)
-        age_ms, misses = float(played.age_ms.mean()), self._misses(arrays, i)
-        qos = QoS(l95_ms, rate, used, max(uncut_ms, l95_ms), age_ms=age_ms, misses=misses)
+        age_ms, per_hour = float(played.age_ms.mean()), float(played.price_per_hour.mean())
+        known, misses = (l95_ms, rate, used, max(uncut_ms, l95_ms)), self._misses(arrays, i)
+        qos = QoS(*known, age_ms=age_ms, misses=misses, price_per_hour=per_hour)
         return CellPrice(qos, terms.cost(qos), windows)
 
     def _misses(self, arrays: Arrays, i: int) -> float | None:

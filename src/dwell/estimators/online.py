@@ -180,7 +180,8 @@ class Online(CellEstimator):
         for name in names:
             one, error = estimates[name], self._stated_error(name)
             known = one.l95_ms, one.violation_rate, one.utilisation, one.cut_from_ms
-            estimates[name] = unchecked_qos(*known, error, self._stated_age(name), one.misses)
+            further = self._stated_age(name), one.misses, None, one.price_per_hour
+            estimates[name] = unchecked_qos(*known, error, *further)
         if self.problem.every_placement is not None:
             return self._paired(names, estimates, incumbent)
         return estimates
@@ -257,6 +258,8 @@ class Online(CellEstimator):
                 qos.error,
                 qos.age,
                 qos.misses,
+                None,
+                qos.price_per_hour,
             )
             for name, (qos, _) in priced.items()
         }

@@ -107,6 +107,8 @@ class Price:
     age: tuple[float, float] | None = None
     #: Share of the stretches of k cycles with more than m misses, if misses are capped.
     misses: float | None = None
+    #: Price of transmitted bytes, money per hour, if links have prices.
+    price_per_hour: float | None = None
 
     @property
     def qos(self) -> QoS:
@@ -114,7 +116,8 @@ class Price:
         used = {name: min(share + self.foreign[name], 1.0) for name, share in self.own.items()}
         error = self.l95_error_ms, self.violation_error
         metrics = self.l95_ms, self.violation_rate, used, self.uncut_l95_ms
-        return QoS(*metrics, error, *(self.age or NO_AGE), self.misses)
+        further = *(self.age or NO_AGE), self.misses
+        return QoS(*metrics, error, *further, price_per_hour=self.price_per_hour)
 
     @property
     def is_good_enough(self) -> bool:
@@ -331,6 +334,7 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         l95_deviation_ms=_deviation(windows_ms, l95_error_ms),
         violation_deviation=_deviation(rates, violation_error),
         age=_age(player, name, windows, is_last=is_last) if problem.objective.weighs_age else None,
+        price_per_hour=float(windows.price_per_hour.mean()) if problem.fabric.has_prices else None,
         misses=None if cap is None else share_over(_missed(player, arrays, since), cap),
     )
 

@@ -100,7 +100,7 @@ class Profile(CellEstimator):
             known = QoS(price.l95_ms, price.violation_rate, {}, price.uncut_l95_ms)
             metrics = known.l95_ms, known.violation_rate, known.cut_from_ms
             age = None if price.age is None else (price.age[0], 0.0)
-            table.append((name, *metrics, age, price.misses))
+            table.append((name, *metrics, age, price.misses, price.price_per_hour))
             work.append((name, tuple(price.own.items())))
         self._table, self._work = tuple(table), tuple(work)
         self.start(problem)
@@ -124,8 +124,10 @@ class Profile(CellEstimator):
         """Estimate every candidate's metrics, the incumbent's too (see `Estimator`)."""
         shares = self.with_work(self.see(observed, incumbent, own), self._work)
         return {
-            name: unchecked_qos(l95_ms, rate, shares[name], cut_from_ms, None, age, misses)
-            for name, l95_ms, rate, cut_from_ms, age, misses in self._table
+            name: unchecked_qos(
+                l95_ms, rate, shares[name], cut_ms, None, age, misses, None, per_hour
+            )
+            for name, l95_ms, rate, cut_ms, age, misses, per_hour in self._table
         }
 
     def see(self, observed: QoS, incumbent: str, own: Mapping[str, float]) -> Foreign:

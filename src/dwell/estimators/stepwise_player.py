@@ -47,8 +47,8 @@ class _Twin:
         #: Means of each step, oldest first: L95 (ms) and V_D, each followed by the mean of the same
         #: windows as declared; uncut L95; the cell's own share of every resource.
         self.steps = Steps(kept, PAIRS + 1 + resources)
-        #: Mean age of each step (ms), followed by its value as declared; then zeros.
-        self.ages = Steps(kept, PAIRS)
+        #: Mean age (ms) and price per hour of each step, each followed by its value as declared.
+        self.terms = Steps(kept, PAIRS)
         #: Last cycle of each step, counted over all repetitions of the realisation.
         self.ends: deque[int] = deque(maxlen=kept)
         #: Latencies of the cycles of each step; which of the cycles with a sink missed.
@@ -61,14 +61,14 @@ class _Twin:
     def add(
         self,
         means: Sequence[float],
-        ages_ms: Sequence[float],
+        terms: Sequence[float],
         latency_ns: Ints,
         missed: NDArray[np.bool_],
         end: int,
     ) -> None:
         """Add a step; drop the oldest beyond the most."""
         self.steps.add(means)
-        self.ages.add(ages_ms)
+        self.terms.add(terms)
         self.ends.append(end)
         self.latency_ns.append(latency_ns)
         self.missed.append(missed)
@@ -76,7 +76,7 @@ class _Twin:
     def keep(self, most: int) -> None:
         """Keep the newest `most` steps."""
         self.steps.keep(most)
-        self.ages.keep(most)
+        self.terms.keep(most)
         while len(self.latency_ns) > most:
             self.latency_ns.popleft()
             self.ends.popleft()
@@ -190,12 +190,17 @@ class StepwisePlayer:
                 _mean(windows.uncut_ms),
                 *_mean_shares(windows.shares[:, 1]),
             )
-            ages_ms = _mean(windows.age_ms), _mean(self.declared.age_ms[name][first:last]), 0, 0
+            terms = (
+                _mean(windows.age_ms),
+                _mean(self.declared.age_ms[name][first:last]),
+                _mean(windows.price_per_hour),
+                _mean(self.declared.price_per_hour[name][first:last]),
+            )
             cycles, tables = slice(first * self._window, twin.cursor), twin.arrays.tables
             latency_ns = tables.latency_ns[0, cycles].copy()
             played = self._pipeline, self.declared.realisation.release_ns, CellArrays(twin.arrays)
             missed = due_misses(*played, cycles)
-            twin.add(means, ages_ms, latency_ns, missed, self._offset + twin.cursor)
+            twin.add(means, terms, latency_ns, missed, self._offset + twin.cursor)
         twin.price = None
         self.cycles += self._step * self._window
 
@@ -279,14 +284,24 @@ class StepwisePlayer:
             (l95_error_ms, violation_error),
             age,
             self._share_over(name),
+            None,
+            self._price_per_hour(name, known.price_per_hour),
         )
 
     def _age(self, name: str, known: tuple[float, float]) -> tuple[float, float]:
         """Return the mean age of a candidate and its error, ms."""
-        steps = self._twins[name].ages
+        steps = self._twins[name].terms
         usual = float(self.declared.age_ms[name][1:].std()) / math.sqrt(self._step)
         age_ms, error_ms, _ = _estimated(steps.sums()[0], len(steps), *known, usual=usual)
         return min(age_ms, self._censor_ms), error_ms
+
+    def _price_per_hour(self, name: str, known: float | None) -> float | None:
+        """Return the price of a candidate's bytes, money per hour, if links have prices."""
+        if known is None:
+            return None
+        steps = self._twins[name].terms
+        usual = float(self.declared.price_per_hour[name][1:].std()) / math.sqrt(self._step)
+        return _estimated(steps.sums()[1], len(steps), known, 0.0, usual=usual)[0]
 
     def _share_over(self, name: str) -> float | None:
         """Return the share of a candidate's stretches with more misses than the cap."""

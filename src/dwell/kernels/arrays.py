@@ -217,7 +217,7 @@ class Arrays:
 #: Tables with rows by cell.
 BY_CELL = (
     *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome", "late_copies"),
-    *("actuated_ns", "actuated_from", "actuated_newest"),
+    *("paid", "actuated_ns", "actuated_from", "actuated_newest"),
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
 )
@@ -752,6 +752,7 @@ class _Layout:
             (task.name, task.name): task.state_bytes for task in problem.pipeline.tasks.values()
         }
         rows = self._addresses(real.delay_ns), real.loss_keys
+        links = problem.fabric.links
         for (source, target, link_name), delay_ns, loss_key in zip(
             (*real.hops, *real.forwards), *rows, strict=True
         ):
@@ -761,6 +762,7 @@ class _Layout:
                     "payload_bytes": payload[source, target],
                     "delay_ns": delay_ns,
                     "loss_key": loss_key,
+                    "price": payload[source, target] * links[link_name].price_per_byte,
                 }
             )
             self.layers.append({})
@@ -868,6 +870,7 @@ class _Layout:
             **dict.fromkeys(("actuated_from", "actuated_newest"), (cells, chains, cycles)),
             "shadow_bytes": (cells if self.shadows else 0, cycles),
             "log_outcome": logged * self.max_tasks,
+            "paid": (cells * any(problem.fabric.has_prices for problem, _ in self.cells), cycles),
             "late_copies": (cells * any(problem.replicas for problem, _ in self.cells), cycles),
         }
         lists: dict[str, list[Any]] = {

@@ -488,6 +488,7 @@ template <class S>
 void release(S& s, i64 cell, i64 cycle, i64 now) {
   const i64 active = s.stamp(cell, cycle);
   s.cell(cell).released = cycle + 1;
+  if (s.paid.size > 0) s.paid[s.output(cell, cycle)] = s.cell(cell).paid;
   if (!S::kPlain) give_up_before(s, cell, cycle, now);
   if (S::kRates) move_values(s, cell, cycle, now);
   clear_log(s, cell, cycle);

@@ -36,6 +36,18 @@ inline i64 transmission_ns(const Hop& hop, const Rate& rate) {
   return whole_ns(std::rint(static_cast<f64>(hop.payload_bytes) * 8000.0 / rate.rate_mbps));
 }
 
+// Transmits a message at the rate of a link; returns the end. The message has its price, also if it
+// is lost later. A cell pays for its shadow.
+template <class S>
+i64 transmit(S& s, i64 cell, const Hop& hop, Link& link, const Rate& rate, i64 start) {
+  link.free_ns = later(start, transmission_ns(hop, rate));
+  if (s.paid.size > 0) {
+    const i64 parent = s.cell(cell).parent;
+    s.cell(parent < 0 ? cell : parent).paid += hop.price;
+  }
+  return link.free_ns;
+}
+
 // Whether an attempt to send a message is lost.
 inline bool loses(const Hop& hop, const Rate& rate, i64 cycle, i64 attempt) {
   return rate.loss > 0.0 && attempt_uniform(hop.loss_key, cycle, attempt) < rate.loss;
@@ -79,8 +91,7 @@ void send(S& s, i64 cell, i64 cycle, i64 flow, i64 hop_row, i64 attempt, i64 now
   i64 sent = start;
   bool is_lost = segment.is_down != 0;
   if (!is_lost) {
-    sent = later(start, transmission_ns(hop, rate));
-    link.free_ns = sent;
+    sent = transmit(s, cell, hop, link, rate, start);
     is_lost = loses(hop, rate, cycle, attempt);
   }
   if (!is_lost) {
@@ -120,8 +131,7 @@ StateAttempt send_state(S& s, i64 hop_row, i64 cycle, i64 attempt, i64 key, i64 
     lose_behind(s, key);
     return {-1, attempt};
   }
-  const i64 sent = later(start, transmission_ns(hop, rate));
-  link.free_ns = sent;
+  const i64 sent = transmit(s, cell_of(key), hop, link, rate, start);
   if (loses(hop, rate, cycle, attempt)) {
     if (link.in_order && attempt == 0) hold(s, hop.link, key, kUnknown);
     const i64 timeout = link.retransmit_ns >= 0 ? link.retransmit_ns : kStateTimeoutNs;

@@ -8,6 +8,8 @@
 
 namespace dwell {
 
+constexpr f64 kHourNs = 3.6e12;
+
 // Rank of L95 among n values: ceil(0.95 n).
 constexpr i64 l95_rank(i64 n) { return (19 * n + 19) / 20; }
 
@@ -100,7 +102,7 @@ template <class S>
     s.ages[S::kRates ? counted++ : i] = std::min(latency_ns, age_ns);
   }
   if (!S::kRates) counted = n;
-  if (counted == 0) return Seen{first, n, 0, 0, 0.0, 0.0, 0.0};
+  if (counted == 0) return Seen{first, n, 0, 0, 0.0, 0.0, 0.0, 0.0};
   const i64 rank = l95_rank(counted);
   i64* ages = s.ages.rows;
   std::nth_element(ages, ages + rank - 1, ages + counted);
@@ -113,6 +115,7 @@ template <class S>
               counted,
               std::min(l95_ms, of.longest_ms),
               lost ? std::numeric_limits<f64>::infinity() : l95_ms,
+              0.0,
               0.0};
 }
 
@@ -123,6 +126,10 @@ Seen measure(S& s, i64 cell, i64 first, i64 n, i64 now) {
   Seen seen = measure_cycles(s, cell, first, n, now);
   if (S::kRates && of.latency_chain >= 0) measure_chain(s, cell, now, seen);
   if (of.weighs_age != 0) seen.age_ms = mean_age_ms(s, cell, first, now);
+  if (s.paid.size > 0) {
+    const f64 paid = of.paid - s.paid[s.output(cell, first)];
+    seen.price_per_hour = paid * kHourNs / static_cast<f64>(now - of.release_ns[first]);
+  }
   return seen;
 }
 

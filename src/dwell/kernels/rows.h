@@ -87,6 +87,7 @@ struct Crossing;  // of meter.cpp
   field(i32, resource_0) field(i32, n_resources) /* in `cell_servers` */                         \
   field(i32, n_flows) field(i32, chain_0) field(i32, n_chains) /* in `chains` */                 \
   field(i32, latency_chain) field(i32, weighs_age) /* whether `Seen` needs ages */               \
+  field(f64, paid) /* price of all transmissions of the cell and its shadow so far */            \
   field(i32, shadow) field(i32, parent)
 
 // Cycles of a chain's first task from which a job descends.
@@ -173,7 +174,8 @@ struct Crossing;  // of meter.cpp
 #define DWELL_RATE(field) field(f64, rate_mbps) field(f64, loss)
 
 #define DWELL_HOP(field)                                                                         \
-  field(Times, delay_ns) field(u64, loss_key) field(i64, payload_bytes) field(i64, link)
+  field(Times, delay_ns) field(u64, loss_key) field(i64, payload_bytes) field(i64, link)         \
+  field(f64, price) /* of each transmission */
 
 // `retransmit_ns` is -1 for a link that drops messages for good.
 #define DWELL_LINK(field)                                                                        \
@@ -214,10 +216,11 @@ struct Crossing;  // of meter.cpp
 
 // Metrics of cycles as known at the end of a window, or when a decision was due. `counted` cycles
 // are not idle. `uncut_ms` is L95 without the limit `longest_ms` of the cell. `age_ms` is the mean
-// over time of the age of the newest command, 0 unless the cell `weighs_age`.
+// over time of the age of the newest command, 0 unless the cell `weighs_age`. `price_per_hour` is
+// the price of all transmissions since the release of the first of the cycles; 0 without prices.
 #define DWELL_SEEN(field)                                                                        \
   field(i64, first_cycle) field(i64, cycles) field(i64, missed) field(i64, counted)              \
-  field(f64, l95_ms) field(f64, uncut_ms) field(f64, age_ms)
+  field(f64, l95_ms) field(f64, uncut_ms) field(f64, age_ms) field(f64, price_per_hour)
 
 // Numbers by which a built-in policy with the estimator `profile` decides (rules.h): the policy's
 // parameters and the objective's, the placements of the cell, and the sums of `ATP` since its last
@@ -388,7 +391,7 @@ DWELL_ROWS(DWELL_STRUCT)
   table(i64, forwarded) table(Chain, chains) table(Descent, descents)                            \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
-  table(i64, late_copies)                                                                        \
+  table(i64, late_copies) table(f64, paid)                                                       \
   table(i64, actuated_ns) table(i64, actuated_from) table(i64, actuated_newest)                  \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \

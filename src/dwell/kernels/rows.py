@@ -147,6 +147,7 @@ class Tables(NamedTuple):
     network_ns: Ints
     outcome: NDArray[np.int8]
     late_copies: Ints  # (cells, N) messages that came after the other copy's; or empty
+    paid: Floats  # (cells, N) price of all transmissions up to the release; or empty
     actuated_ns: Ints  # (cells, chains, N) completion of a chain's last task, or NEVER_NS
     actuated_from: Ints  # (cells, chains, N) the origin of this actuation
     actuated_newest: Ints  # (cells, chains, N) newest cycle that it descends from, -1 for none

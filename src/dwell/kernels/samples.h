@@ -41,8 +41,7 @@ void send_forward(S& s, i64 key, i64 attempt, i64 now) {
     if (link.retransmit_ns >= 0) lose_behind(s, key);
     return;
   }
-  const i64 sent = later(start, transmission_ns(hop, rate));
-  link.free_ns = sent;
+  const i64 sent = transmit(s, cell_of(key), hop, link, rate, start);
   if (!loses(hop, rate, cycle, attempt)) {
     const i64 arrival = later(sent, propagation_ns(s, hop_row, segment, cycle));
     post_arrival(s, hop.link, key, arrival, attempt > 0);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Literal, NamedTuple, TypeAlias
 
 from dwell.model.bounds import (
@@ -95,6 +95,12 @@ class Node:
         "How many accelerators of each kind it has, as `{gpu: 1}`.",
         Bound(1, 4096, whole=True),
         default_factory=FrozenDict,
+    )
+    price_per_hour: float = key(
+        "Money per hour while a placement uses it; in reports only, not in J.",
+        Bound(0, LARGEST),
+        default=0.0,
+        is_rare=True,
     )
     bursts: Bursts | None = key(
         "Foreign work of other tenants, in every scenario.", default=None, tier="measured"
@@ -256,6 +262,12 @@ class Link:
         default=None,
         named="on_loss.retransmit_ms",
     )
+    price_per_gb: float = key(
+        "Money per 10⁹ payload bytes that it transmits, lost and repeated messages included.",
+        Bound(0, LARGEST),
+        default=0.0,
+        is_rare=True,
+    )
     in_order: bool = key(
         "Whether messages arrive in the order in which they were sent; they wait for a lost "
         "message that is sent again.",
@@ -275,6 +287,11 @@ class Link:
     def name(self) -> str:
         """``R1->E``."""
         return f"{self.source}->{self.target}"
+
+    @property
+    def price_per_byte(self) -> float:
+        """Money per byte that it transmits."""
+        return self.price_per_gb / 1e9
 
 
 @declared()
@@ -301,6 +318,20 @@ class Fabric:
     def resources(self) -> Mapping[str, Resource]:
         """The nodes' CPUs, then their accelerators, by name."""
         return {one.name: one for one in resources_of(self.nodes)}
+
+    @property
+    def has_prices(self) -> bool:
+        """Whether bytes on some link have a price."""
+        return any(link.price_per_gb > 0 for link in self.links.values())
+
+    @property
+    def has_node_prices(self) -> bool:
+        """Whether some node has a price."""
+        return any(node.price_per_hour > 0 for node in self.nodes.values())
+
+    def price_per_hour(self, nodes: Collection[str]) -> float:
+        """Price of some nodes, money per hour."""
+        return sum(node.price_per_hour for name, node in self.nodes.items() if name in nodes)
 
     def tier(self, tier: Tier) -> tuple[str, ...]:
         """Names of a tier's nodes, in the file's order."""

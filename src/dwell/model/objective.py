@@ -44,10 +44,13 @@ class Weights:
         default=0.0,
         is_rare=True,
     )
+    price: float = key(
+        "Weight of the price of transmitted bytes / target.", WEIGHT, default=0.0, is_rare=True
+    )
 
     def __post_init__(self) -> None:
         values = (self.latency, self.violations, self.robot, self.edge, self.switching, self.cloud)
-        if not any((*values, self.age)):
+        if not any((*values, self.age, self.price)):
             raise ProblemError(
                 [Fault("weights", "all weights are 0; at least one must be above 0")]
             )
@@ -69,6 +72,11 @@ class Targets:
     )
     age_ms: float | None = key(
         "Of the mean age, ms; needed where `weights` has `age`.", TARGET, default=None
+    )
+    price_per_hour: float | None = key(
+        "Of the price of transmitted bytes, money per hour; needed where `weights` has `price`.",
+        TARGET,
+        default=None,
     )
 
 
@@ -138,6 +146,10 @@ class Objective:
             faults.append(Fault("targets.cloud", "missing; weights.cloud weighs cloud nodes apart"))
         if self.weighs_age and self.targets.age_ms is None:
             faults.append(Fault("targets.age_ms", "missing; weights.age weighs the mean age"))
+        if self.weighs_price and self.targets.price_per_hour is None:
+            faults.append(
+                Fault("targets.price_per_hour", "missing; weights.price weighs transmitted bytes")
+            )
         if faults:
             raise ProblemError(faults)
 
@@ -155,3 +167,8 @@ class Objective:
     def weighs_age(self) -> bool:
         """Whether J has a term of the mean age."""
         return self.weights.age > 0
+
+    @property
+    def weighs_price(self) -> bool:
+        """Whether J has a term of the price of transmitted bytes."""
+        return self.weights.price > 0

@@ -64,6 +64,11 @@ class Placement(FrozenDict[str, Nodes]):
         """The placement of the second copy; None except for `Replicas`."""
         return None
 
+    @property
+    def nodes(self) -> frozenset[str]:
+        """The nodes on which its tasks run."""
+        return frozenset(node for copy in self.copies for node in copy.values())
+
     def moved(self, other: Placement) -> tuple[str, ...]:
         """Tasks whose set of nodes changes between the two, in this placement's order."""
         return tuple(

@@ -106,6 +106,9 @@ class Problem(Displayed):
         faults = [*find_faults(self.parts), *self._unplaced()]
         if faults:
             raise ProblemError(faults)
+        priced = self.fabric.has_prices or not self.objective.weighs_price
+        bound = "0 in a cell without a link that has a price_per_gb"
+        require(priced, "weights.price", self.objective.weights.price, bound)
         self._require_due_sinks()
         self._require_supported_replicas()
 

@@ -51,6 +51,9 @@ class QoS:
     paired : tuple of float, optional
         In a cell whose candidates come from a search: standard errors of the differences of
         `l95_ms` and `violation_rate` from the incumbent's estimates on the same samples.
+    price_per_hour : float, optional
+        Price of the bytes that links transmit, money per hour; finite, at least 0. Needed if J
+        weighs it.
 
     Raises
     ------
@@ -67,6 +70,7 @@ class QoS:
     age_error_ms: float = 0.0
     misses: float | None = None
     paired: tuple[float, float] | None = None
+    price_per_hour: float | None = None
 
     def __post_init__(self) -> None:
         l95_ms, cut_from_ms = self.l95_ms, self.cut_from_ms
@@ -93,7 +97,12 @@ class QoS:
                     raise MetricError(
                         f"error of {metric} is {value!r}; it must be finite and at least 0"
                     )
-        for name, least in (("age_ms", self.age_ms), ("age_error_ms", self.age_error_ms)):
+        further = {
+            "age_ms": self.age_ms,
+            "age_error_ms": self.age_error_ms,
+            "price_per_hour": self.price_per_hour,
+        }
+        for name, least in further.items():
             if least is not None and not 0 <= least < INFINITY:
                 raise MetricError(f"{name} is {least!r}; it must be finite and at least 0")
         if self.misses is not None and not 0 <= self.misses <= 1:
@@ -122,6 +131,7 @@ class QoS:
     _set_age_error_ms,
     _set_misses,
     _set_paired,
+    _set_price_per_hour,
 ) = (getattr(QoS, name).__set__ for name in QoS.__match_args__)
 
 
@@ -134,6 +144,7 @@ def unchecked_qos(
     age: tuple[float, float] | None = None,
     misses: float | None = None,
     paired: tuple[float, float] | None = None,
+    price_per_hour: float | None = None,
 ) -> QoS:
     """Make a QoS without checks, in a third of the time.
 
@@ -151,6 +162,7 @@ def unchecked_qos(
     _set_age_error_ms(qos, age_error_ms)
     _set_misses(qos, misses)
     _set_paired(qos, paired)
+    _set_price_per_hour(qos, price_per_hour)
     return qos
 
 

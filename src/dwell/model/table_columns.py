@@ -22,10 +22,19 @@ Kind: TypeAlias = Literal[
 ]
 #: Optional features of a run: `live` processes; shadows through alternatives (`shadows`); an
 #: estimator that reports samples and age of its estimates (`support`); a cell of a `fleet`;
-#: decisions between the ends of windows (`between`); a weighed `age`; a cap on `misses`; a
-#: `chain` in place of the latency; candidates with two copies (`replicas`).
+#: decisions between the ends of windows (`between`); a weighed `age`; a `price` of bytes;
+#: a cap on `misses`; a `chain` in place of the latency; candidates with two copies (`replicas`).
 Feature: TypeAlias = Literal[
-    "live", "shadows", "support", "fleet", "between", "age", "misses", "chain", "replicas"
+    "live",
+    "shadows",
+    "support",
+    "fleet",
+    "between",
+    "age",
+    "price",
+    "misses",
+    "chain",
+    "replicas",
 ]
 
 
@@ -97,6 +106,7 @@ SUPPORT: tuple[Feature, ...] = ("support",)
 FLEET: tuple[Feature, ...] = ("fleet",)
 BETWEEN: tuple[Feature, ...] = ("between",)
 AGE: tuple[Feature, ...] = ("age",)
+PRICE: tuple[Feature, ...] = ("price",)
 MISSES: tuple[Feature, ...] = ("misses",)
 CHAIN: tuple[Feature, ...] = ("chain",)
 UNACTUATED = "the chain did not actuate in the cycle"
@@ -188,6 +198,13 @@ WINDOWS = (
         null=UNMEASURED,
     ),
     Column("seen_age_ms", "Float64", "Mean age up to the close, as in J.", "ms", UNSEEN, AGE),
+    Column(
+        "seen_price_per_hour",
+        "Float64",
+        "Price of the bytes that links transmitted up to the close, money per hour.",
+        null=UNSEEN,
+        of=PRICE,
+    ),
     Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),
     Column(
         AGE_OF,
@@ -262,6 +279,13 @@ DECISIONS = (
     ),
     Column("seen_age_ms", "Float64", "Mean age since the first of them.", "ms", GUARD, AGE),
     Column(
+        "seen_price_per_hour",
+        "Float64",
+        "Price of transmitted bytes since the first of them, money per hour.",
+        null=f"{GUARD}, or a live cell",
+        of=PRICE,
+    ),
+    Column(
         "j_{candidate}",
         "Float64",
         "Estimated J of a candidate against the incumbent.",
@@ -283,6 +307,13 @@ DECISIONS = (
         null=GUARD,
     ),
     Column("est_age_ms_{candidate}", "Float64", "Its estimated mean age.", "ms", GUARD, AGE),
+    Column(
+        "est_price_per_hour_{candidate}",
+        "Float64",
+        "Its estimated price of transmitted bytes, money per hour.",
+        null=GUARD,
+        of=PRICE,
+    ),
     Column(
         "est_misses_{candidate}",
         "Float64",

@@ -22,6 +22,7 @@ from dwell.cost import (
     price,
     tier_nodes,
     weighed_age_ms,
+    weighed_price,
 )
 from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
@@ -77,13 +78,23 @@ def _shares(
 class Pricing:
     """Prices the candidates of one policy."""
 
-    __slots__ = ("_cloud", "_edge", "_robot", "_rows", "_weighs_age", "candidates", "objective")
+    __slots__ = (
+        "_cloud",
+        "_edge",
+        "_robot",
+        "_rows",
+        "_weighs_age",
+        "_weighs_price",
+        "candidates",
+        "objective",
+    )
 
     def __init__(self, candidates: Mapping[str, Placement], objective: Objective) -> None:
         if not isinstance(objective, Objective):
             raise PolicyError(f"objective is {objective!r}; it must be an Objective")
         self.candidates = candidates
-        self.objective, self._weighs_age = objective, objective.weighs_age
+        self.objective = objective
+        self._weighs_age, self._weighs_price = objective.weighs_age, objective.weighs_price
         nodes = tier_nodes(objective)
         of = objective.accelerators
         self._robot, self._edge = _shares(nodes.robot, of), _shares(nodes.edge, of)
@@ -190,6 +201,7 @@ class Pricing:
             switching,
             self.objective,
             weighed_age_ms(qos, self.objective) if self._weighs_age else 0.0,
+            weighed_price(qos, self.objective) if self._weighs_price else 0.0,
         )
 
     def _explain(self, qos: object, whose: str) -> NoReturn:

@@ -12,7 +12,7 @@ import numpy as np
 from dwell.display import Measure
 from dwell.model.bounds import counted
 from dwell.model.objective import AIM
-from dwell.model.table_columns import OF_CHAINS, SHARE_OF, USE_OF
+from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.policies.registry import estimator_of
 from dwell.report.charts import (
     NO_LIMIT,
@@ -31,7 +31,7 @@ from dwell.report.palette import Palette
 from dwell.report.table import WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.topology import topology
 from dwell.study import over_seeds, under, windows_behind
-from dwell.study.metric import METRICS, metric_of
+from dwell.study.metric import METRICS, further_columns, metric_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -317,9 +317,8 @@ class PolicyBlocks:
     def more(self) -> Table:
         """Return further numbers of every policy in every scenario."""
         used = [USE_OF.format(resource=name) for name in self.problem.fabric.resources]
-        chains = self.problem.pipeline.chains
-        ages = [of.format(chain=name) for name in chains for of in OF_CHAINS]
-        known = (*MORE, *ages, "seen_age_ms", *used, *self.found.metrics)
+        further = further_columns(self.problem.pipeline.chains)
+        known = (*MORE, *further, *used, *self.found.metrics)
         metrics = [metric_of(column) for column in known if column in self.runs.columns]
         return Table(
             f"{self.prefix}more",

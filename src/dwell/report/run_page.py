@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from dwell.display import Measure, decimals_for, write_number
 from dwell.model.bounds import counted
-from dwell.model.table_columns import OF_CHAINS
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES, shown_reason
 from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
@@ -48,7 +47,7 @@ from dwell.report.run_header import RunHeader
 from dwell.report.table import MOST_ROWS, WITHOUT_WARMUP, Columns, Table, Text
 from dwell.report.timeline import begins_by_number, resources_in, run_timeline
 from dwell.report.topology import topology
-from dwell.study.metric import METRICS, metric_of
+from dwell.study.metric import METRICS, further_columns, metric_of
 from dwell.study.other_placements import PLACEMENTS
 from dwell.study.predicted_moves import predicted_moves
 from dwell.study.summary import (
@@ -147,8 +146,7 @@ class _RunPage:
             metric = METRICS[column]
             yield Fact(metric.title, metric.text(row[column]), remark, word)
         chains = self.header.problem.pipeline.chains
-        ages = [of.format(chain=name) for name in chains for of in OF_CHAINS]
-        for metric in map(metric_of, (*ages, "seen_age_ms")):
+        for metric in map(metric_of, further_columns(chains)):
             if metric.column in row:
                 yield Fact(metric.title, metric.text(row[metric.column]), "")
         yield Fact("cycles", write_number(row["cycles"], 0))

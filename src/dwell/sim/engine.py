@@ -39,7 +39,10 @@ from dwell.sim.tables import PlayedRealisation, make_tables
 from dwell.sim.versions import versions
 
 #: Columns of the kernel's table `seen`.
-SEEN = "first_cycle", "cycles", "missed", "counted", "l95_ms", "uncut_ms", "age_ms"
+SEEN = (
+    *("first_cycle", "cycles", "missed", "counted"),
+    *("l95_ms", "uncut_ms", "age_ms", "price_per_hour"),
+)
 
 
 def simulate(
@@ -451,15 +454,16 @@ class SimulatedStamper:
         if self.evidence is not None:
             first = boundary - self.every
             controller.learn(partial(self.evidence, first, boundary, close_ns))
-        _, _, missed, counted, l95_ms, uncut_ms, age_ms = [
+        _, _, missed, counted, l95_ms, uncut_ms, age_ms, per_hour = [
             column.item(0, index) for column in self.seen
         ]
         seen = l95_ms, missed / counted, uncut_ms
+        terms = {"age_ms": age_ms, "price_per_hour": per_hour}
         shares = self.shares[0, index]
         if self.looks:
-            proposal = controller.propose_on(*seen, shares[1], recent=shares[0], age_ms=age_ms)
+            proposal = controller.propose_on(*seen, shares[1], recent=shares[0], **terms)
         else:
-            proposal = controller.propose_on(*seen, shares, age_ms=age_ms)
+            proposal = controller.propose_on(*seen, shares, **terms)
             self.metrics.append(proposal.seen)
         if watch is None or not self.course.by_guard:
             controller.commit(proposal)

@@ -38,6 +38,12 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound=np.generic)
 
+#: Columns of windows that some cells have: the kernel's metric, and the feature.
+TERMS: dict[str, tuple[str, Feature]] = {
+    "seen_age_ms": ("age_ms", "age"),
+    "seen_price_per_hour": ("price_per_hour", "price"),
+}
+
 
 @dataclass(eq=False)
 class PlayedRealisation:
@@ -100,6 +106,7 @@ class PlayedRealisation:
         has: dict[Feature, bool] = {
             "shadows": len(self.arrays.tables.cells) > 1,
             "age": self.problem.objective.weighs_age,
+            "price": self.problem.fabric.has_prices,
             "replicas": bool(self.problem.replicas),
             "chain": self.problem.objective.latency is not None,
         }
@@ -294,7 +301,7 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
             **{name: values for name, values in seen.items() if name.startswith("u_")},
-            **{name: values for name, values in seen.items() if name == "seen_age_ms"},
+            **{name: values for name, values in seen.items() if name in TERMS},
             "cost": seen["cost"],
             **_age_columns(played),
             "overtaken": lambda: played.by_window(played.overtaken).sum(axis=1),
@@ -383,9 +390,9 @@ def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     else:
         metrics = np.array(played.metrics, np.float64).reshape(-1, 3)
         seen = dict(zip(("l95_ms", "violation_rate", "cost"), metrics.T, strict=True))
-    if played.problem.objective.weighs_age:
-        age_ms = np.where(np.isnan(seen["l95_ms"]), np.nan, played.seen["age_ms"])
-        seen["seen_age_ms"] = age_ms
+    for name, (metric, feature) in TERMS.items():
+        if feature in played.features:
+            seen[name] = np.where(np.isnan(seen["l95_ms"]), np.nan, played.seen[metric])
     used = played.shares[:, 0]
     return seen | {f"u_{name}": used[:, i] for i, name in enumerate(played.controller.resources)}
 
@@ -402,7 +409,8 @@ def _costs(played: PlayedRealisation, seen: dict[str, Floats]) -> Floats:
     moved[1:] = moved_shares(problem)[stamps[:-1], stamps[1:]]
     switching = played.by_window(moved).sum(axis=1)
     seen_of = seen["l95_ms"], seen["violation_rate"]
-    costs = seen_costs(problem, *seen_of, used, switching, played.seen["age_ms"])
+    terms = played.seen["age_ms"], played.seen["price_per_hour"]
+    costs = seen_costs(problem, *seen_of, used, switching, *terms)
     unseen = [played.host_down(at_ns) for at_ns in played.close_ns.tolist()]
     for values in (*seen.values(), costs):
         values[unseen] = np.nan

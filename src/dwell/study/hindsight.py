@@ -74,15 +74,16 @@ class _Alone:
 def require_supported(problem: Problem, what: str) -> None:
     """Raise a SimulationError for cells that `what` does not support.
 
-    These are cells in which no sink is due in some cycles, and objectives with ages or a cap on
-    misses.
+    These are cells in which no sink is due in some cycles, and objectives with ages, prices or a
+    cap on misses.
     """
     if problem.pipeline.has_idle_cycles:
         raise SimulationError(
             f"{what} do not support cell {problem.name!r}, because no sink is due in some of its "
             "cycles; let a sink run in each cycle, or leave them out"
         )
-    if name := problem.objective.beyond_cycles:
+    objective = problem.objective
+    if name := objective.beyond_cycles or ("weights.price" if objective.weighs_price else ""):
         raise SimulationError(
             f"{what} do not support objective.{name} of cell {problem.name!r}; remove it, or leave "
             "them out"

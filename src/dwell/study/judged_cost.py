@@ -44,7 +44,9 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
     l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
     objective = problem.objective
     age_ms = windows["seen_age_ms"] if objective.weighs_age else 0.0
-    return price(l95_ms, rate, *tier_use(windows, problem), switching, objective, age_ms)
+    per_hour = windows["seen_price_per_hour"] if objective.weighs_price else 0.0
+    used = tier_use(windows, problem)
+    return price(l95_ms, rate, *used, switching, objective, age_ms, per_hour)
 
 
 def _require_same_latency(run: Run, problem: Problem) -> None:
@@ -55,6 +57,11 @@ def _require_same_latency(run: Run, problem: Problem) -> None:
             f"a run with objective.latency {own.latency} and weights.age {own.weights.age:g} has "
             f"no J with {judge.latency} and {judge.weights.age:g}; give all policies the same "
             "objective.latency, and a weights.age above 0 if any has one"
+        )
+    if judge.weighs_price and not run.problem.fabric.has_prices:
+        raise SimulationError(
+            f"a run whose links have no price_per_gb has no J with weights.price "
+            f"{judge.weights.price:g}; give all policies the same links"
         )
 
 

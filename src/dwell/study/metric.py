@@ -5,7 +5,7 @@ Terminal, pages, tables, intervals and docs use `METRICS`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -71,6 +71,8 @@ METRICS: Mapping[str, Metric] = {
             values="median",
         ),
         Metric("seen_age_ms", "age in J", "ms", wording="mean of windows", values="positive"),
+        Metric("seen_price_per_hour", "price of bytes", "/h", decimals=4, values="positive"),
+        Metric("nodes_price_per_hour", "price of nodes", "/h", decimals=4, values="positive"),
         Metric("u_robot", "U_r", "%", 100.0, wording="busiest robot", values="positive"),
         Metric("u_edge", "U_e", "%", 100.0, wording="busiest edge node", values="positive"),
         Metric("migrations", "migrations", values="positive"),
@@ -109,6 +111,12 @@ METRICS: Mapping[str, Metric] = {
         Metric("j_still", "J without moves", decimals=2, values="positive"),
     )
 }
+
+
+def further_columns(chains: Iterable[str]) -> list[str]:
+    """Return the columns of ages and prices, which only some cells have."""
+    ages = [of.format(chain=name) for name in chains for of in OF_CHAINS]
+    return [*ages, "seen_age_ms", "seen_price_per_hour", "nodes_price_per_hour"]
 
 
 def declared(column: str) -> Metric | None:

@@ -35,8 +35,9 @@ from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints, Mask
 from dwell.model.order_statistic import rank_of
 from dwell.model.stretches import misses_in
-from dwell.model.table_columns import OF_CHAINS, SHARE_OF, USE_OF
+from dwell.model.table_columns import SHARE_OF, USE_OF
 from dwell.record.moves import by_guard
+from dwell.study.metric import further_columns
 from dwell.study.quality import actuations, age_of_information, track
 
 if TYPE_CHECKING:
@@ -205,7 +206,7 @@ def summarise(run: Run, problem: Problem, labels: Mapping[str, str | int]) -> Su
         **_migrations(decisions, decided),
         **{SHARE_OF.format(candidate=name): share_of(those) for name, those in active.items()},
         "cost": answer["cost"],
-        **_ages(windows, counts, problem),
+        **_further(windows, counts, active, problem),
         **_unfinished(cycles.names("outcome")[counted][due]),
         "longest_misses": longest_streak(missed),
         **_misses(missed),
@@ -259,12 +260,18 @@ def _answer(windows: TableArrays, counts: Mask, missed: Mask) -> dict[str, float
     }
 
 
-def _ages(windows: TableArrays, counts: Mask, problem: Problem) -> dict[str, float]:
-    """Return means over windows: the columns of chains, and the mean age if J weighs it."""
-    columns = [of.format(chain=name) for name in problem.pipeline.chains for of in OF_CHAINS]
-    if problem.objective.weighs_age:
-        columns.append("seen_age_ms")
-    return {column: mean_of(windows[column][counts]) for column in columns}
+def _further(
+    windows: TableArrays, counts: Mask, active: Mapping[str, Mask], problem: Problem
+) -> dict[str, float]:
+    """Return means over windows: ages, and prices of bytes and of the nodes of placements."""
+    columns = [column for column in further_columns(problem.pipeline.chains) if column in windows]
+    means = {column: mean_of(windows[column][counts]) for column in columns}
+    if problem.fabric.has_node_prices:
+        means["nodes_price_per_hour"] = sum(
+            problem.fabric.price_per_hour(placement.nodes) * share_of(active[name])
+            for name, placement in problem.candidates.items()
+        )
+    return means
 
 
 def moves_of(run: Run, problem: Problem) -> dict[str, int]:

@@ -57,9 +57,15 @@ const moved = ({ migrations, returns, guard_moves }) => {
 export const decided = (root, cell, page) => {
   const rows = new Map();
   const body = make("tbody");
-  const metrics = ["J", "L95 (ms)", "V_D", ...(cell.weighs_age ? ["age (ms)"] : [])];
-  const shown = (value) =>
-    [number(value?.cost, 2), number(value?.l95_ms, 1), percent(value?.violation_rate, 2), number(value?.age_ms, 1)].slice(0, metrics.length);
+  const terms = [
+    ["J", (value) => number(value?.cost, 2)],
+    ["L95 (ms)", (value) => number(value?.l95_ms, 1)],
+    ["V_D", (value) => percent(value?.violation_rate, 2)],
+    ...(cell.weighs_age ? [["age (ms)", (value) => number(value?.age_ms, 1)]] : []),
+    ...(cell.weighs_price ? [["price/h", (value) => number(value?.price_per_hour, 4)]] : []),
+  ];
+  const metrics = terms.map(([name]) => name);
+  const shown = (value) => terms.map(([, text]) => text(value));
   const words = ["candidate", ...metrics, ""];
   for (const { name, hue } of cell.candidates) {
     const values = metrics.map(() => make("td", { class: "num" }));

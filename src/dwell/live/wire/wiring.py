@@ -189,6 +189,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
+    _require_no_prices(problem)
     _require_no_replicas(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
@@ -343,6 +344,15 @@ def require_candidates(problem: Problem) -> None:
         message = f"not supported in the live cell {problem.name}"
         remedy = "paste the block of `dwell candidates CELL --yaml`"
         raise ProblemError([Fault("candidates.all", f"{message}; {remedy}")])
+
+
+def _require_no_prices(problem: Problem) -> None:
+    """Raise a LiveError if J needs prices, which live windows do not have."""
+    if problem.objective.weighs_price:
+        raise LiveError(
+            f"objective.weights.price: not supported in the live cell {problem.name}; only the "
+            "simulator measures prices: remove it, or use dwell run"
+        )
 
 
 def _require_no_replicas(problem: Problem) -> None:
