@@ -64,34 +64,44 @@ $(VENV)/.installed: $(VENV)/.pinned pyproject.toml lab/pyproject.toml hatch_buil
 demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real trace)
 	$(BIN)/python -m dwell demo $(if $(REAL),--real $(REAL))
 
-# Most tests run side by side; those that need the machine to themselves follow, one after another.
-# pytest ends with 5 where ARGS leave nothing to run.
 TESTS := $(BIN)/python -m pytest
 BESIDE := -n auto --no-loadscope-reorder
+# Runs all tests that the marks in $(1) leave. Real processes that keep a period run next to the
+# others, which have a lower priority; tests that need the machine to themselves follow. Each part
+# keeps its failures in a folder of its own, so that none overwrites those of another.
+# pytest ends with 5 where ARGS leave nothing to run.
+define run_tests
+	@mkdir -p build; ok() { "$$@" || [ $$? -eq 5 ]; }; \
+	ok $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS) \
+		>build/with_priority.txt 2>&1 & prior=$$!; \
+	ok nice -n 10 $(TESTS) $(BESIDE) -m "$(1)not alone and not with_priority" $(ARGS); beside=$$?; \
+	wait $$prior; prior=$$?; cat build/with_priority.txt; \
+	ok $(TESTS) -o cache_dir=.pytest_cache/alone -m "$(1)alone" $(ARGS); alone=$$?; \
+	[ "$$beside $$prior $$alone" = "0 0 0" ]
+endef
+# Tests of a flat that any machine runs in minutes.
+QUICK := not exhaustive and not alone and not with_priority
 # Folders of tests, by flat.
 SIMULATOR := cellfile control estimators kernels model policies record reference regression report sim study
 LIVE := calibration dash live
 
 test: env ## Run the tests (ARGS="-k name" passes options to pytest, "--hypothesis-profile night" tries more)
-	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
-	$(TESTS) -m "not exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
+	$(call run_tests,not exhaustive and )
 
 test-sim: env ## Run the tests of the simulator, without those of commands
-	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(addprefix tests/,$(SIMULATOR)) $(ARGS)
+	$(TESTS) $(BESIDE) -m "$(QUICK)" $(addprefix tests/,$(SIMULATOR)) $(ARGS)
 
 test-live: env ## Run the tests of the live runtime, its page and `dwell profile`
-	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" $(addprefix tests/,$(LIVE)) $(ARGS)
+	$(TESTS) $(BESIDE) -m "$(QUICK)" $(addprefix tests/,$(LIVE)) $(ARGS)
 
 test-lab: env ## Run the tests of the laboratory
-	$(TESTS) $(BESIDE) -m "not exhaustive and not alone" lab/tests $(ARGS)
+	$(TESTS) $(BESIDE) -m "$(QUICK)" lab/tests $(ARGS)
 
 test-all: env ## Run the tests that `make test` leaves out (conftest.py)
-	$(TESTS) $(BESIDE) -m "exhaustive and not alone" $(ARGS) || [ $$? -eq 5 ]
-	$(TESTS) -m "exhaustive and alone" $(ARGS) || [ $$? -eq 5 ]
+	$(call run_tests,exhaustive and )
 
 tests: env ## Run `make test` and `make test-all` in one, as .ci/run does
-	$(TESTS) $(BESIDE) -m "not alone" $(ARGS) || [ $$? -eq 5 ]
-	$(TESTS) -m alone $(ARGS) || [ $$? -eq 5 ]
+	$(call run_tests,)
 
 # Side by side. clang-tidy reads the headers of the system's own C++ library.
 check: env ## Lint, formatting, types, the borders between packages and lines of code

@@ -19,6 +19,7 @@ BENCHMARKS = {
     "learning": ("loop", "learning"),
     "canonical": ("canonical", "measure"),
     "length": ("canonical", "length"),
+    "replicated": ("replicated", "measure"),
     "closing": ("closing", "measure"),
     "deciding": ("deciding", "measure"),
     "pricing": ("pricing", "measure"),

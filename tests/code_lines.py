@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 28_153, "live": 16_146, "lab": 6_819}
+MOST = {"simulator": 28_188, "live": 16_346, "lab": 6_822}
 
 
 def code_lines(text: str) -> int:

@@ -165,7 +165,11 @@ def objects(
         *(estimator_by_name(name, canonical) for name in ("profile", "shadow", "scaling")),
         *(controller, controller.estimator, controller.course, proposal),
         Presence.of(canonical),
-        *(FallbackRound(["LOC"]), Failures.of(canonical), ShadowPlan(0, 9, [0.05] * 3)),
+        *(
+            FallbackRound(["LOC"]),
+            Failures.of(canonical),
+            ShadowPlan(0, 9, [0.05, 0.05], [[1], [0]]),
+        ),
         Guard(["LOC"], patience_ns=3, probe_cycles=30, placement="SO"),
         CellGuard(canonical),
         Probation(30, health_cycles=10, patience_ns=1),

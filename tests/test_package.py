@@ -8,8 +8,10 @@ import re
 import shutil
 import subprocess
 import sys
+import sysconfig
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -34,8 +36,15 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def installed(source: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder that holds what the wheel holds, built from the source distribution."""
+    """Return a folder that holds what the wheel holds, built from the source distribution.
+
+    The kernel of this checkout is taken if its sources and options are those of the distribution:
+    to compile it again takes half a minute.
+    """
     folder = tmp_path_factory.mktemp("wheel")
+    built = source / "build" / re.sub(r"[-.]", "_", sysconfig.get_platform())
+    built.mkdir(parents=True)
+    shutil.copy2(ROOT / "src" / "dwell" / "kernels" / NAME, built)
     build("wheel", source, folder)
     (wheel,) = folder.glob("dwell_placement-*.whl")
     shutil.unpack_archive(wheel, folder / "site", "zip")
@@ -98,16 +107,17 @@ def run(
     )
 
 
-@pytest.fixture
-def environment(installed: Path, tmp_path: Path) -> Callable[[str], Path]:
-    """Return what makes an environment with the wheel and one of its extras, pinned as here."""
+@pytest.fixture(scope="module")
+def environment(installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Return a function that makes an environment, once per extra, with pins as here."""
     if not UV.is_file():
         pytest.skip("uv is not beside the interpreter; `make env` installs it")
     (wheel,) = installed.parent.glob("*.whl")
     pins = ROOT / "requirements" / "dev.txt"
 
+    @cache
     def made(extra: str) -> Path:
-        folder = tmp_path / (extra or "base")
+        folder = tmp_path_factory.mktemp(extra or "base") / "environment"
         run(UV, "venv", "--quiet", "--python", sys.executable, folder)
         python = folder / "bin" / "python"
         into = (UV, "pip", "install", "--quiet", "--python", python, "--constraint", pins)
@@ -164,24 +174,6 @@ def test_a_robot_runs_and_moves_a_cell_with_the_extra_live_alone(
     assert "placement LOC stays, and its record expects no other of any candidate" in log
     # What the robot could not write, this environment reads of the journal.
     assert "SO" in dwell.open_run(folder).cycles["placement"].cast(str).to_list()
-
-
-def test_the_laboratory_is_a_wheel_of_its_own(
-    environment: Callable[[str], Path], tmp_path: Path
-) -> None:
-    python = environment("all")
-    cell = next((python.parents[1] / "lib").glob("*/site-packages/dwell/examples/canonical.yaml"))
-    assert run(python, "-m", "dwell", "check", cell).returncode == 0
-    words = ("testbed", "doctor")
-    without = run(python, "-m", "dwell", *words)
-    assert without.returncode == 2
-    assert without.stderr.startswith("error: dwell testbed needs dwell-lab; ")
-    build("wheel", ROOT / "lab", tmp_path)
-    (wheel,) = tmp_path.glob("dwell_lab-*.whl")
-    added = run(UV, "pip", "install", "--quiet", "--no-deps", "--python", python, wheel)
-    assert added.returncode == 0, added.stderr
-    assert run(python, "-m", "dwell", *words).returncode in (0, 1)
-    assert run(python, "-m", "dwell", "validate", "--help").returncode == 0
 
 
 def test_the_extra_report_alone_reports_a_run(
@@ -253,3 +245,22 @@ def test_a_stranger_s_way_from_the_wheel_to_a_report_of_his_own_policy(
     assert dwell.open_run(home / "third").meta["policy"] == "policy:Mine"
     with capsys.disabled():
         print("", *(f"{seconds:6.1f} s  {step}" for step, seconds in took_s), sep="\n")
+
+
+def test_the_laboratory_is_a_wheel_of_its_own(
+    environment: Callable[[str], Path], tmp_path: Path
+) -> None:
+    """Goes on from the test before: both need each extra."""
+    python = environment("all")
+    cell = next((python.parents[1] / "lib").glob("*/site-packages/dwell/examples/canonical.yaml"))
+    assert run(python, "-m", "dwell", "check", cell).returncode == 0
+    words = ("testbed", "doctor")
+    without = run(python, "-m", "dwell", *words)
+    assert without.returncode == 2
+    assert without.stderr.startswith("error: dwell testbed needs dwell-lab; ")
+    build("wheel", ROOT / "lab", tmp_path)
+    (wheel,) = tmp_path.glob("dwell_lab-*.whl")
+    added = run(UV, "pip", "install", "--quiet", "--no-deps", "--python", python, wheel)
+    assert added.returncode == 0, added.stderr
+    assert run(python, "-m", "dwell", *words).returncode in (0, 1)
+    assert run(python, "-m", "dwell", "validate", "--help").returncode == 0

@@ -22,7 +22,7 @@ from dwell.live.wire.wiring import PORTS_PER_ROLE, roles
 from dwell.model.document import to_document
 from tests.cli.small_cell import ROOT, call
 from tests.ports import free_ports
-from tests.waiting import PATIENCE_S
+from tests.waiting import PATIENCE_S, pause
 
 EXAMPLE = ROOT / "examples" / "live"
 
@@ -164,30 +164,30 @@ class RealCell:
 
     def until(self, holds: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
         """Ask for the status until something holds."""
-        limit_s = time.monotonic() + PATIENCE_S
+        begin_s = time.monotonic()
         found: dict[str, Any] = {}
         with OperatorClient(self.problem, self.environment) as visitor:
-            while time.monotonic() < limit_s:
+            while (waited_s := time.monotonic() - begin_s) < PATIENCE_S:
                 try:
                     found = visitor.ask("status", patience_s=1.0)
                 except LiveError:
                     continue
                 if holds(found):
                     return found
-                time.sleep(0.02)
+                pause(waited_s)
         logs = "\n".join(f"{p.name}: {p.read_text()}" for p in self.folder.glob("*.log"))
         raise AssertionError(f"it has not come about: {json.dumps(found, indent=1)}\n{logs}")
 
     def show(self, holds: Callable[[str], object], *options: str | Path, code: int = 0) -> str:
         """Print the status, by the command, until its output is as wanted, with its exit code."""
-        limit_s = time.monotonic() + PATIENCE_S
+        begin_s = time.monotonic()
         stdout = ""
-        while time.monotonic() < limit_s:
+        while (waited_s := time.monotonic() - begin_s) < PATIENCE_S:
             found, stdout, _ = invoke("live", "status", *options, "--cell", self.file)
             if stdout and holds(stdout):
                 assert found == code
                 return stdout
-            time.sleep(0.02)
+            pause(waited_s)
         raise AssertionError(f"the status never read so; the last one: {stdout}")
 
     def note(self, who: str) -> Callable[[dict[str, Any]], str]:

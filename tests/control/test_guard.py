@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.control import (
+    CellGuard,
     Controller,
     Failures,
     Guard,
@@ -23,7 +24,7 @@ from dwell.control import (
 )
 from dwell.cost import hamming
 from dwell.errors import PolicyError, ProblemError
-from dwell.model import Decision, FrozenDict, QoS
+from dwell.model import Decision, FrozenDict, QoS, Replicas
 from dwell.model.chain import ChainPatience
 from dwell.model.instants import EVIDENCE_NS
 from tests.cells.deterministic import cell
@@ -608,6 +609,39 @@ def test_a_candidate_is_whole_while_all_of_it_is_heard_within_g_periods() -> Non
 
 
 # ----------------------------------------------------------------------------------- the return
+
+
+def test_replicas_are_whole_while_one_member_is() -> None:
+    members = {"BOTH": ("LOC", "SO")}
+    presence = Presence({"LOC": ["R1", "R2"], "SO": ["R1", "E"]}, 3 * P, members)
+    presence.heard("R1", 0)
+    assert presence.missing("BOTH", P) == {"R2"}
+    presence.heard("E", P)
+    assert presence.whole("BOTH", P)
+    assert not presence.whole("BOTH", 3 * P)
+    assert presence.missing("BOTH", 3 * P) == {"R1"}
+
+
+@pytest.mark.parametrize(("fallback", "probed"), [("LOC", "OFF"), ("OFF", "LOC"), ("FAR", "LOC")])
+def test_probes_of_replicas_go_through_a_member_that_is_not_in_force(
+    fallback: str, probed: str
+) -> None:
+    problem = cell()
+    both = Replicas({name: problem.candidates[name] for name in ("LOC", "OFF")})
+    mine = CellGuard(replace(problem, candidates={**problem.candidates, "BOTH": both}))
+    assert mine.probed is None
+    mine.adopt(fallback, fallback=True)
+    mine.probation.want("BOTH")
+    assert mine.probed == probed
+    for name in {*problem.candidates} - {probed}:
+        mine.shadow_sent(0, 0, name)
+        mine.shadow_arrived(0, 0, name)
+    assert mine.probation.done(0) == 0
+    for cycle in range(mine.probation.needed):
+        assert not mine.probation.proven("BOTH", cycle)
+        mine.shadow_sent(cycle, cycle, probed)
+        mine.shadow_arrived(cycle, cycle, probed)
+    assert mine.probation.proven("BOTH", mine.probation.needed)
 
 
 def probation(h: int = 3, health: int = 10) -> Probation:

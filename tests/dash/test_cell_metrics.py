@@ -18,6 +18,7 @@ from dwell.dash.metrics import CellMetrics
 from dwell.live.host.security import Security
 from dwell.live.trust.authority import Authority
 from tests.dash.stand_in import StandIn
+from tests.live.replicated_cells import replicated
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).parents[2]
@@ -61,6 +62,15 @@ def test_latencies_are_counted_by_bounds_of_which_one_is_the_deadline(cell: Stan
     assert value(cell, "dwell_cycles_total", outcome="actuated") == 5
     assert value(cell, "dwell_cycles_total", outcome="lost") == 1
     assert value(cell, "dwell_cycles_total", outcome="stale") == 0
+
+
+def test_a_task_with_two_copies_is_on_two_nodes() -> None:
+    cell = StandIn(replicated(), placement="BOTH")
+    cell.well()
+    assert value(cell, "dwell_placement_info", placement="BOTH") == 1
+    for task, nodes in {"perception": ("R1", "E"), "planning": ("R2", "E")}.items():
+        for node in nodes:
+            assert value(cell, "dwell_task_placement_info", task=task, node=node) == 1
 
 
 def test_each_cycle_is_counted_once_however_often_somebody_asks(cell: StandIn) -> None:

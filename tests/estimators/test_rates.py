@@ -19,7 +19,7 @@ from dwell.kernels.arrays import CellArrays
 from dwell.kernels.random_draws import draw
 from dwell.model import Problem
 from dwell.study.summary import summarise
-from tests.cells.rated import idle_cell, inner_loop
+from tests.cells.rated import drawn, idle_cell, inner_loop
 
 SEEDS = range(6)
 
@@ -78,6 +78,23 @@ def test_a_sampled_message_that_no_shadow_gets_is_no_loss() -> None:
     cell["candidates"] = {"LOC": {"detect": "R", "control": "R"}}
     cell["candidates"]["FAR"] = {"detect": "R", "control": "E"}
     run = simulate(from_document(cell), policy="LOC", estimator="corrected", seed=1, windows=30)
+    assert (run.decisions["est_violation_rate_FAR"].to_numpy() < 0.2).all()
+
+
+def test_a_message_that_a_slower_task_does_not_wait_for_is_no_loss_of_a_shadow() -> None:
+    """Control waits for each tenth result of a filter, which a shadow computes on E."""
+    controller = {"shadow_fraction": 0.2, "decide_cycles": 80}
+    cell = inner_loop(deadline_ms=30, window_cycles=80, controller=controller)
+    for name in ("camera", "detect"):
+        del cell["tasks"][name]
+    on = {node: {"exec_ms": drawn(1)} for node in ("R", "E")}
+    cell["tasks"] |= {"clock": {"on": {"R": {"exec_ms": 1}}, "every": 10}, "filter": {"on": on}}
+    cell["tasks"]["control"]["every"] = 10
+    pairs = ("imu", "filter"), ("filter", "control"), ("clock", "control")
+    cell["flows"] = [{"from": source, "to": target} for source, target in pairs]
+    cell["candidates"] = {"LOC": {"filter": "R", "control": "R"}}
+    cell["candidates"]["FAR"] = {"filter": "E", "control": "R"}
+    run = simulate(from_document(cell), policy="LOC", estimator="corrected", seed=1, windows=20)
     assert (run.decisions["est_violation_rate_FAR"].to_numpy() < 0.2).all()
 
 

@@ -146,7 +146,7 @@ def test_cycles_of_hindered_candidates_alone_are_sent_through_others() -> None:
     real = draw(problem, scenario="baseline", seed=1, windows=4)
     shadows = SentShadows(problem, real, FRACTION)
     player = CandidatePlayer([(problem, real)], shadows=shadows)
-    for index, sent in enumerate([shadow_stamps(0, 200, 0, 2, FRACTION), np.full(200, -1)]):
+    for index, sent in enumerate([shadow_stamps(0, 200, [1], FRACTION), np.full(200, -1)]):
         stamps = player.tables({0: list(problem.candidates)[index]}).tables.stamps
         np.testing.assert_array_equal(stamps, [np.full(200, index), sent])
 

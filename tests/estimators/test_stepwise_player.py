@@ -474,7 +474,7 @@ def test_random_cells_come_to_what_runs_do(seed: int, kind: str) -> None:
 @pytest.mark.parametrize("kind", ["threads", "delay"])
 def test_errors_cover_what_they_say(kind: str) -> None:
     within = []
-    for seed in range(20):
+    for seed in range(12):
         for one, price in both(random_dag(seed), kind, seed, 10):
             known = price.l95_error_ms, price.violation_error
             off = abs(one.l95_ms - price.l95_ms), abs(one.violation_rate - price.violation_rate)

@@ -22,5 +22,17 @@ def test_a_grace_shorter_than_the_guard_is_warned_of() -> None:
     assert "up to 7 cycles are lost instead of 4" in found
 
 
+def test_a_state_that_lags_behind_is_warned_of() -> None:
+    cell = document()
+    cell["tasks"]["planning"]["state_bytes"] = 9
+    for after_ms in (0, 10):
+        both = {"replicas": ["LOC", "SO"], "after_ms": after_ms}
+        problem = from_document({**cell, "candidates": {**cell["candidates"], "BOTH": both}})
+        found = [str(fault) for fault in lint(problem) if "BOTH" in str(fault)]
+        assert [one.partition(": 10 is not")[0] for one in found] == (
+            ["candidates.BOTH.after_ms"] * bool(after_ms)
+        )
+
+
 def test_a_cell_for_the_simulator_is_not_warned_of() -> None:
     assert not list(lint(dwell.load("examples/canonical.yaml")))

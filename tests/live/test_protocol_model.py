@@ -10,13 +10,19 @@ from typing import Any
 
 import pytest
 
-from docs.protocol import fallbacks, gate, orders, states
+from docs.protocol import copies, fallbacks, gate, orders, states
 from docs.protocol.checker import Rules, Step, explore, stuck, without
 from dwell.control import Guard
 from dwell.model import Problem
 from tests.live.small_world import World, canonical
 
-MODELS = {"fallbacks": fallbacks, "gate": gate, "orders": orders, "states": states}
+MODELS = {
+    "copies": copies,
+    "fallbacks": fallbacks,
+    "gate": gate,
+    "orders": orders,
+    "states": states,
+}
 #: The case that shows that a rule is needed, where that is not the first.
 SHOWN = {
     **{("gate", rule): 1 for rule in ("run", "boot", "heard", "equal")},
@@ -37,12 +43,14 @@ STEPS = 24
 @pytest.mark.parametrize(
     ("model", "limits"),
     [
+        *((copies, limits) for limits in copies.CASES),
         *((fallbacks, limits) for limits in fallbacks.CASES),
         *((gate, limits) for limits in gate.CASES),
         *((orders, limits) for limits in orders.CASES),
         *((states, limits) for limits in states.CASES),
     ],
     ids=[
+        *(f"copies {i}" for i, _ in enumerate(copies.CASES)),
         *(f"fallbacks {i}" for i, _ in enumerate(fallbacks.CASES)),
         *(f"gate {i}" for i, _ in enumerate(gate.CASES)),
         *(f"orders {i}" for i, _ in enumerate(orders.CASES)),

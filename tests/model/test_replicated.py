@@ -93,6 +93,11 @@ def test_hamming_counts_tasks_whose_set_of_nodes_changes() -> None:
 @pytest.mark.parametrize(
     ("both", "path", "words"),
     [
+        ({"replicas": "LOC"}, "replicas", "name two candidates, as [LOC, SO]"),
+        ({"replicas": "LOC", "after_ms": 5}, "replicas", "'LOC' is not allowed; it must be a list"),
+        ({"replicas": {"ONE": "LOC"}}, "replicas", "a mapping is not allowed; it must be a list"),
+        ({"after_ms": 5}, "replicas", "missing"),
+        ({"replicas": []}, "replicas", "exactly two"),
         ({"replicas": ["LOC"]}, "replicas", "exactly two"),
         ({"replicas": ["LOC", "LOC"]}, "replicas", "exactly two"),
         ({"replicas": ["LOC", "SO", "FAR"]}, "replicas", "exactly two"),

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from dwell.model import Flow, Pipeline
-from dwell.model.placement import Copy
+from dwell.model.placement import Copy, Placement
 
 
 class Rates:
@@ -81,8 +81,8 @@ class Rates:
         found = [task for tasks in behind for task in tasks]
         return [start, *found] if found else []
 
-    def apart(self, active: Copy, other: Copy) -> set[str]:
-        """Return the tasks that run on another node under `other`, or behind such a task."""
+    def apart(self, active: Placement, other: Copy) -> set[str]:
+        """Return the tasks on other nodes, or on two, under `active`, and all behind them."""
 
         def is_apart(task: str) -> bool:
             before = [flow.source for flow in self.waited_inputs(task)]

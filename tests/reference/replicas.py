@@ -24,7 +24,8 @@ class Copies:
         self.names = {second(task): task for task in problem.pipeline.tasks}
         self.cycles: dict[int, Replicas] = {}
         self.done: set[int] = set()
-        self.heard: set[tuple[int, str]] = set()
+        #: When nodes heard of cycles.
+        self.heard: dict[tuple[int, str], int] = {}
         #: Node of the sender of each message that is held, by cycle and flow.
         self.held: dict[tuple[int, int], str] = {}
         #: Flows to a common task of which a message counts.
@@ -45,6 +46,25 @@ class Copies:
     def placements(self, name: str) -> tuple[Copy, ...]:
         """Return the placement of each copy of a candidate."""
         return self.problem.candidates[name].copies
+
+    def plain(self, active: str) -> list[str]:
+        """Return `active`, and the candidates that shadows go through under it, in their order."""
+        known = self.problem.candidates
+        placed = known[active]
+        left_out = placed.members if isinstance(placed, Replicas) else ()
+        return [
+            name
+            for name, one in known.items()
+            if name == active or not (isinstance(one, Replicas) or name in left_out)
+        ]
+
+    def probed(self, wanted: str, fallback: str) -> str:
+        """Return the candidate of the probes: a member of replicas that is not in force."""
+        placed = self.problem.candidates[wanted]
+        if not isinstance(placed, Replicas):
+            return wanted
+        first, other = placed.members
+        return other if first == fallback else first
 
     def release(self, cycle: int, candidate: str) -> None:
         """Note the copies of a cycle."""

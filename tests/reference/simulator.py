@@ -175,9 +175,9 @@ class Result:
     instant at which a decision is due, whether or not the controller's node is up.
     `closest_ns` is the least distance, below a microsecond, of two events that have nothing to do
     with each other (see `closest_unrelated`); None where there is no such pair. `late` counts the
-    messages of each cycle that came after the other copy's. Jobs of second copies have the name
-    `second(task)`, and so have both ends of their messages. `transmitted` has each transmission of
-    a link.
+    messages of each cycle that came after the other copy's; `heard` is when nodes heard that cycles
+    with two copies were done. Jobs of second copies have the name `second(task)`, and so have both
+    ends of their messages. `transmitted` has each transmission of a link.
     """
 
     cycles: tuple[CycleResult, ...]
@@ -191,6 +191,7 @@ class Result:
     closest_ns: int | None
     late: Mapping[int, int] = field(default_factory=dict)
     transmitted: Sequence[Transmission] = ()
+    heard: Mapping[tuple[int, str], int] = field(default_factory=dict)
 
     @property
     def busy(self) -> Mapping[str, tuple[Fraction, ...]]:
@@ -972,25 +973,29 @@ class Simulation:
         """Whether an own job is due on an accelerator of a node before a shadow job would end."""
 
         def on_it(cycle: int, kind: str) -> list[str]:
-            placement = self.placed[ITSELF, cycle]
-            tasks = self.pipeline.tasks.values()
-            here = [task.name for task in tasks if placement[task.name] == node]
-            return [name for name in here if self.execution(name, node).accelerator == kind]
+            there = [
+                (name, row)
+                for name in self.pipeline.tasks
+                for row in (name, second(name))[: 1 + self.copies.is_doubled(cycle, name)]
+                if self.node_of(ITSELF, cycle, row) == node
+            ]
+            return [row for name, row in there if self.execution(name, node).accelerator == kind]
 
         def awaited(kind: str, job: Job) -> bool:
             end = self.now + nanoseconds(job.execution.exec_ms.expectation)
             period = nanoseconds(self.pipeline.period_ms)
             for cycle, (active, _) in enumerate(self.stamps):
-                for task in on_it(cycle, kind):
-                    due = self.release[cycle] + self.soonest.get((active, task), 0)
+                for row in on_it(cycle, kind):
+                    task = self.copies.names.get(row, row)
+                    due = self.release[cycle] + self.soonest.get((active, row), 0)
                     follows = cycle == len(self.stamps) - 1 and self.rates.is_due(task, cycle + 1)
                     if follows and due + period < end:
                         return True
                     if not self.rates.is_due(task, cycle):
                         continue
-                    missing = (ITSELF, cycle, task) not in self.jobs
-                    lost = (ITSELF, cycle) in self.flawed
-                    if missing and not lost and due < end and self.now < due + period:
+                    missing = (ITSELF, cycle, row) not in self.jobs
+                    over = (ITSELF, cycle) in self.flawed or self.copies.has_heard(cycle, node)
+                    if missing and not over and due < end and self.now < due + period:
                         return True
             return False
 
@@ -1058,6 +1063,7 @@ class Simulation:
             closest_ns=closest_unrelated(self.log),
             late=self.copies.late,
             transmitted=tuple(self.transmitted),
+            heard=self.copies.heard,
         )
 
     def results(self, cell: int) -> dict[tuple[int, str], JobResult]:
@@ -1345,6 +1351,7 @@ class Simulation:
 
     def is_there(self, candidate: str) -> bool:
         """Whether nothing of a candidate is missing."""
+        # Only of fallbacks, which have no replicas.
         placement = self.problem.candidates[candidate].first
         since = [self.node_down_since(node) for node in placement.values()]
         for name, task in self.pipeline.tasks.items():
@@ -1470,9 +1477,9 @@ class Simulation:
         active = [name for first, name in self.moves if first <= cycle][-1]
         wishes = [name for first, name in self.wishes if first <= cycle]
         if wishes and wishes[-1] is not None:
-            return active, wishes[-1]
+            return active, self.copies.probed(wishes[-1], active)
         fraction = self.fractions.get(active, 0.0)
-        return active, shadow_stamp(cycle, active, list(self.problem.candidates), fraction)
+        return active, shadow_stamp(cycle, active, self.copies.plain(active), fraction)
 
     def releaser(self, cycle: int) -> Callable[[], None]:
         def release() -> None:
@@ -1487,7 +1494,7 @@ class Simulation:
             if other is not None:
                 self.placed[SHADOW, cycle] = self.problem.candidates[other].first
                 self.apart[cycle] = self.rates.apart(
-                    self.placed[ITSELF, cycle], self.placed[SHADOW, cycle]
+                    self.problem.candidates[active], self.placed[SHADOW, cycle]
                 )
             self.move_values(cycle)
             if self.guard is not None:
@@ -1564,9 +1571,9 @@ class Simulation:
     def start_source(self, cell: int, cycle: int, task: str) -> None:
         # Reading: a source with an offset is released when its offset is over. On a node that is
         # down its job is lost as soon as it is ready.
-        if self.is_given_up(cell, cycle) or self.copies.has_heard(
-            cycle, self.node_of(cell, cycle, task)
-        ):
+        if self.is_given_up(cell, cycle):
+            return
+        if cell == ITSELF and self.copies.has_heard(cycle, self.node_of(cell, cycle, task)):
             return
         job = self.make_job(cell, cycle, task, ())
         if self.nodes[job.node].down:
@@ -1656,6 +1663,10 @@ class Simulation:
 
     # ----------------------------------------------------------------------- inputs and workers
 
+    def is_common(self, cell: int, cycle: int, task: str) -> bool:
+        """Whether a task of a cycle with two copies runs once; shadows have one copy."""
+        return cell == ITSELF and self.copies.is_common(cycle, task)
+
     def node_of(self, cell: int, cycle: int, row: str) -> str:
         """Return the node of a task, or of its second copy."""
         if row in self.pipeline.tasks:
@@ -1677,11 +1688,11 @@ class Simulation:
         if self.nodes[node].down:
             needed = not flow.sampled and self.rates.is_needed(flow.target, cycle)
             self.lose(cell, cycle, "node_down", is_needed=needed)
-            if not flow.sampled and not self.copies.is_common(cycle, task):
+            if not flow.sampled and not self.is_common(cell, cycle, task):
                 self.lost_joins.add(key)
             return
         self.arrived[cell, cycle, *ends] = self.now
-        if self.copies.is_late(cycle, flow, task, node):
+        if cell == ITSELF and self.copies.is_late(cycle, flow, task, node):
             return
         if cell == SHADOW:
             self.hear_back(SHADOW, cycle)
@@ -1720,9 +1731,9 @@ class Simulation:
             senders=senders,
         )
         self.jobs[cell, cycle, row] = job
-        if cell == ITSELF and not is_second:
+        if cell == ITSELF:
             since, under = self.now - self.release[cycle], self.stamps[cycle][0]
-            self.soonest[under, name] = min(since, self.soonest.get((under, name), since))
+            self.soonest[under, row] = min(since, self.soonest.get((under, row), since))
         return job
 
     def queue_up(self, job: Job) -> None:
@@ -1752,7 +1763,7 @@ class Simulation:
         pool = self.pools[job.cell, job.task.name, job.node]
         pool.idle += 1
         self.take(pool, job.node)
-        if self.copies.has_heard(job.cycle, job.node):
+        if job.cell == ITSELF and self.copies.has_heard(job.cycle, job.node):
             return
         outputs = [
             flow
@@ -1761,7 +1772,7 @@ class Simulation:
         ]
         for flow in outputs:
             self.send_output(job.cell, flow, job, is_second=job.is_second)
-        if self.copies.is_common(job.cycle, job.task.name):
+        if self.is_common(job.cell, job.cycle, job.task.name):
             for flow in outputs:
                 if self.copies.is_doubled(job.cycle, flow.target):
                     self.send_to_second(flow, job)
@@ -1806,10 +1817,10 @@ class Simulation:
         for number, node, way in self.copies.ways(cycle):
 
             def hear(node: str = node) -> None:
-                self.copies.heard.add((cycle, node))
-                for (_, _, site), pool in self.pools.items():
+                self.copies.heard[cycle, node] = self.now
+                for (cell, _, site), pool in self.pools.items():
                     waiting = [job for job in pool.waiting if job.cycle == cycle]
-                    for job in waiting if site == node else ():
+                    for job in waiting if (cell, site) == (ITSELF, node) else ():
                         pool.waiting.remove(job)
 
             self.at(self.now + way, START, cycle, 2 * len(self.pipeline.tasks) + number, hear)
@@ -1843,7 +1854,7 @@ class Simulation:
                 self.index[row],
                 flow=self.pipeline.flows.index(flow),
                 is_needed=not flow.sampled and self.rates.is_needed(flow.target, cycle),
-                is_stopped=lambda: self.copies.has_heard(cycle, job.node),
+                is_stopped=lambda: cell == ITSELF and self.copies.has_heard(cycle, job.node),
             ),
         )
 
@@ -1952,7 +1963,7 @@ class Simulation:
         for cell, cycle, task in list(self.inputs):
             if self.node_of(cell, cycle, task) == name:
                 del self.inputs[cell, cycle, task]
-                if self.copies.is_common(cycle, task):
+                if self.is_common(cell, cycle, task):
                     self.copies.await_again(cycle, task)
                 else:
                     self.lost_joins.add((cell, cycle, task))

@@ -36,7 +36,7 @@ from dwell.model.fleet import Fleet, FleetEntry
 from dwell.sim.fleet import drawn, phased, play_fleet
 from tests.reference.simulator import NEAR_NS, simulate
 
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "25"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "16"))
 #: Fleets of cells with several rates.
 RATED = max(EXAMPLES // 3, 1)
 #: Where jobs share a core, events within a microsecond may come in either order.

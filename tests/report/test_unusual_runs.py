@@ -16,8 +16,8 @@ from dwell.record import Run
 from dwell.report import run_html
 from dwell.report.run_page import run_page
 from tests.cli.small_cell import SMALL
-from tests.dash.browser import READY, chromium, in_browser, opened, settled
-from tests.dash.served import serving
+from tests.dash.browser import READY, chromium, in_browser, opened, settled, wait_for
+from tests.dash.served import Served, serving
 from tests.report.pages import figure_of
 
 LONG = "a-placement-with-a-name-of-forty-letters"
@@ -101,24 +101,33 @@ def test_the_report_fits_and_the_browser_is_silent(
         assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """Return the page of a folder with one run of each kind."""
+    folder = tmp_path_factory.mktemp("runs")
+    for kind in KINDS:
+        made(kind, folder).save(folder / kind)
+    with serving(folder, folder) as page:
+        yield page
+
+
 @in_browser
 @pytest.mark.parametrize(("kind", "width", "scheme"), RUNS)
 def test_the_page_of_the_run_fits_and_the_browser_is_silent(
-    kind: str, width: int, scheme: str, tmp_path: Path, browser: Browser
+    kind: str, width: int, scheme: str, served: Served, browser: Browser
 ) -> None:
-    made(kind, tmp_path).save(tmp_path / "run")
-    with serving(tmp_path, tmp_path / "run") as served:
-        size = {"width": width, "height": 900}
-        with opened(
-            browser, served.address, ready=READY, viewport=size, color_scheme=scheme
-        ) as page:
-            settled(page)
-            assert page.evaluate("document.documentElement.scrollWidth") <= width
-            verdict = page.locator(".verdict .judged").inner_text()
-            if kind in ("all missed", "all lost"):
-                assert "100.00 %" in verdict
-            if kind == "all met":
-                assert "0.00 %" in verdict
+    place = served.get("/cells")["runs"]["runs"].index(kind)
+    size, listed = {"width": width, "height": 900}, "document.querySelector('tbody th')"
+    with opened(browser, served.address, ready=listed, viewport=size, color_scheme=scheme) as page:
+        page.goto(f"http://{served.host}/cell/{place}")
+        wait_for(page, READY)
+        settled(page)
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        verdict = page.locator(".verdict .judged").inner_text()
+        if kind in ("all missed", "all lost"):
+            assert "100.00 %" in verdict
+        if kind == "all met":
+            assert "0.00 %" in verdict
 
 
 def test_a_lost_l95_has_no_value_and_a_mark_of_its_own(tmp_path: Path) -> None:

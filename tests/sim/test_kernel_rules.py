@@ -22,7 +22,7 @@ from dwell.sim.engine import simulate_realisation
 from tests.cells.generated import random_problem
 
 CELL = Path(__file__).parents[2] / "examples" / "canonical.yaml"
-EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "60"))
+EXAMPLES = int(os.environ.get("DWELL_EXAMPLES", "30"))
 
 
 #: 5 ms less of a target of 100 ms are 0.05 of J: in floats sometimes a little more or less.

@@ -149,7 +149,7 @@ def test_a_comparison_shows_the_price_of_bytes_and_of_nodes() -> None:
 def test_a_weight_needs_a_target_and_a_price() -> None:
     with pytest.raises(ProblemError, match=r"targets\.price_per_hour: missing"):
         Objective(weights=Weights(price=1.0), targets=Targets(latency_ms=100.0))
-    with pytest.raises(ProblemError, match=r"weights\.price.*price_per_gb"):
+    with pytest.raises(ProblemError, match=r"objective\.weights\.price.*price_per_gb"):
         weighing(free(), 1.0)
 
 

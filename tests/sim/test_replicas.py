@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,11 +11,11 @@ import pytest
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.errors import ProblemError, SimulationError
+from dwell.errors import ProblemError
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import Meter, Site
+from dwell.estimators.measured import Message, Meter, Site
 from dwell.estimators.profile import Profile
-from dwell.model import Problem
+from dwell.model import Problem, QoS
 from tests.reference.test_against import Probe
 
 CELL: dict[str, Any] = {
@@ -106,9 +108,89 @@ def test_a_cancelled_copy_is_not_lost(cell: Problem) -> None:
     assert (seen.cycles.ready_ns[:, 4] == -2).sum() > 45
 
 
-def test_no_guard_in_a_cell_with_replicas(cell: Problem) -> None:
-    with pytest.raises(SimulationError, match="the guard does not support replicas"):
-        dwell.simulate(cell, policy="dtp", seed=1, windows=2, guard=True)
+def failing(*nodes: str) -> Problem:
+    """Return the cell with a third candidate, and a scenario: nodes are down from 3 s on."""
+    disturbances = [{"node": name, "at_s": 3, "for_s": 100, "down": True} for name in nodes]
+    work = {"on": {name: {"exec_ms": 0.5} for name in "ABC"}}
+    return from_document(
+        {
+            **CELL,
+            "nodes": {**CELL["nodes"], "C": {"tier": "edge"}},
+            "links": [
+                *CELL["links"],
+                {"from": "R", "to": "C", "both_ways": True, "delay_ms": 1},
+            ],
+            "tasks": {**CELL["tasks"], "work": work},
+            "candidates": {**CELL["candidates"], "THREE": {"work": "C"}},
+            "controller": {"fallbacks": ["THREE", "ONE"], "probe_cycles": 5},
+            "scenarios": {"fails": disturbances},
+        }
+    )
+
+
+class Wish:
+    """A policy that always wants one candidate."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
+        """Return it."""
+        return self.name
+
+
+def guarded(problem: Problem, wish: str) -> dwell.Run:
+    """Simulate a policy with a wish under the guard, from 3 s on in the scenario."""
+    controller = replace(problem.controller, initial=wish)
+    problem = replace(problem, controller=controller)
+    policy = Wish(wish)
+    return dwell.simulate(problem, policy=policy, scenario="fails", seed=1, windows=4, guard=True)
+
+
+def test_the_guard_stays_while_one_copy_completes_cycles() -> None:
+    run = guarded(failing("A"), "NOW")
+    assert {*run.cycles["placement"]} == {"NOW"}
+    assert {*run.cycles["outcome"]} == {"done"}
+
+
+def test_the_guard_leaves_replicas_of_which_neither_copy_completes_cycles() -> None:
+    run = guarded(failing("A", "B"), "NOW")
+    lost = (run.cycles["outcome"] != "done").to_list()
+    # Patience is three periods; two more cycles are released up to the move.
+    assert lost == [False] * 15 + [True] * 3 + [False] * (len(lost) - 18)
+    assert run.cycles["placement"].to_list() == ["NOW"] * 18 + ["THREE"] * (len(lost) - 18)
+
+
+@pytest.mark.parametrize(("down", "returns"), [("A", False), ("B", True)])
+def test_probes_of_replicas_go_through_their_first_member(down: str, returns: bool) -> None:
+    problem = failing("A", "B")
+    (one,) = (item for item in problem.scenario("fails") if down != item.node)
+    others = [item for item in problem.scenario("fails") if down == item.node]
+    problem = replace(problem, scenarios={"fails": (replace(one, for_s=10.0), *others)})
+    run = guarded(problem, "NOW")
+    assert (run.cycles["placement"][-1] == "NOW") == returns
+
+
+def test_no_shadow_goes_through_a_member_of_the_replicas_in_force() -> None:
+    problem, probe = failing(), Probe(0.1)
+    dwell.simulate(problem, policy="NOW", estimator=probe, seed=1, windows=2)
+    names = list(problem.candidates)
+    sent = {names[i] for seen in probe.evidence for i in seen.shadow_placement if i >= 0}
+    assert sent == {"THREE"}
+    times = Meter(problem).times(probe.evidence[0])
+    assert times[Site("work", "C")] == pytest.approx(0.5)
+    dwell.simulate(problem, policy="ONE", estimator=probe, seed=1, windows=2)
+    sent = {names[i] for seen in probe.evidence for i in seen.shadow_placement if i >= 0}
+    assert sent == {"TWO", "THREE"}
+
+
+def test_messages_to_a_node_that_is_down_are_not_cancelled() -> None:
+    problem, probe = failing("B"), Probe(0.0)
+    dwell.simulate(problem, policy="NOW", estimator=probe, scenario="fails", seed=1, windows=3)
+    link = Message("camera", "work", "R->B")
+    first, *_, last = (Meter(problem).times(seen)[link] for seen in probe.evidence)
+    assert np.isfinite(first).all()
+    assert np.isinf(last).all()
 
 
 def test_a_search_leaves_replicas_out(cell: Problem) -> None:

@@ -161,15 +161,15 @@ def test_a_metric_that_is_not_there_is_a_fault_of_the_file(
 
 
 @pytest.mark.parametrize(
-    ("metric", "message"),
+    ("metric", "message", "processes"),
     [
-        ("none", "returned None; return a finite number"),
-        ("yes", "returned True; return a finite number"),
-        ("unknown", "returned nan; return a finite number"),
-        ("fails", "ZeroDivisionError: division by zero (hall_metrics.py:25)"),
+        ("none", "returned None; return a finite number", 1),
+        ("yes", "returned True; return a finite number", 1),
+        ("unknown", "returned nan; return a finite number", 1),
+        ("fails", "ZeroDivisionError: division by zero (hall_metrics.py:25)", 1),
+        ("fails", "ZeroDivisionError: division by zero (hall_metrics.py:25)", 2),
     ],
 )
-@pytest.mark.parametrize("processes", [1, 2])
 def test_a_metric_that_fails_is_named_with_its_run(
     study: Path, metric: str, message: str, processes: int
 ) -> None:

@@ -18,10 +18,11 @@ pytestmark = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2,
     reason="twenty processes that must keep to a period of 80 ms need two CPUs",
 )
-#: The seed, the number of faults, and how many of them happen in any case: about 9 s per fault on
-#: two CPUs that are idle, longer on busy ones. No two faults of both places are of the same kind.
-PLACES = {"loopback": (1, 8, 4), "hosts": (824, 5, 3)}
-SECONDS = 130.0
+#: The seed, the number of faults, and how many of them happen in any case: about 6 s per fault on
+#: two CPUs that are idle, longer on busy ones. No two faults of both places are of the same kind;
+#: other tests on real processes kill, freeze and slow them and set their clocks.
+PLACES = {"loopback": (15203, 4, 3), "hosts": (824, 4, 3)}
+SECONDS = 90.0
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -50,7 +51,7 @@ def test_every_fault_is_of_another_kind() -> None:
         for seed, faults, _ in PLACES.values()
         for one in islice(planned(seed, list(faults_of(problem, disks=True))), faults)
     ]
-    assert len(kinds) == len(set(kinds)) == 13
+    assert len(kinds) == len(set(kinds)) == 8
 
 
 def test_a_campaign_without_a_fault_has_failed(tmp_path: Path) -> None:

@@ -397,8 +397,10 @@ class CandidateForm(Form):
 
     def read(self, value: Any, path: str, faults: Faults) -> Any:
         """Return a dict of nodes by task, or the entry of replicas."""
-        # A task may have the name `replicas`.
-        if isinstance(value, dict) and isinstance(value.get("replicas"), list):
+        # A task may have the name `replicas` or `after_ms`; its node is a text.
+        replicated = value if isinstance(value, dict) else {}
+        is_placed = isinstance(replicated.get("replicas", ""), str)
+        if not is_placed or isinstance(replicated.get("after_ms"), float | int):
             return REPLICATED.read(value, path, faults)
         return PLACED.read(value, path, faults)
 

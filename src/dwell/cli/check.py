@@ -19,6 +19,7 @@ from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
 from dwell.model.controller_settings import AUTO
 from dwell.model.entry_points import WARNINGS, added, added_name
+from dwell.model.shadow_plan import alternatives
 
 if TYPE_CHECKING:
     from dwell.estimators.prices import Price
@@ -241,9 +242,13 @@ def _shadow_notes(
     problem: Problem, tried: Mapping[str, Sequence[ShadowPrice]], fractions: Mapping[str, float]
 ) -> Iterator[str]:
     """Yield the shares of shadows, and why they are not larger."""
-    if problem.replicas:
-        yield "shadows: none, since a candidate has replicas"
-        return
+    # Replicas whose members are the only other candidates send no shadows.
+    idle = {
+        name
+        for name, others in zip(problem.candidates, alternatives(problem.candidates), strict=True)
+        if name in problem.replicas and not others
+    }
+    fractions = {name: fraction for name, fraction in fractions.items() if name not in idle}
     most = problem.shadow_fraction
     if free := [name for name, fraction in fractions.items() if fraction == most]:
         yield f"shadows: {most:g} under {', '.join(free)}"

@@ -806,7 +806,7 @@ def _shadow_fractions(estimator: CellEstimator, problem: Problem) -> FrozenDict[
     fractions = by_candidate(estimator.shadow_fraction, problem.candidates)
     for fraction in fractions.values():
         SHADOW_FRACTION.check(who, fraction)
-        message = too_many_shadows(fraction, len(problem.candidates))
+        message = too_many_shadows(fraction, len(problem.plain_candidates))
         if message:
             raise ProblemError([Fault(who, message)])
     return FrozenDict({name: float(fraction) for name, fraction in fractions.items()})

@@ -507,16 +507,24 @@ class Presence:
     Parameters
     ----------
     parts : mapping of str to collection of str
-        Parts of each candidate; see `parts_of`.
+        Parts of each candidate without replicas; see `parts_of`.
     within_ns : int
         Age from which on a sign of life no longer counts.
+    members : mapping of str to collection of str, optional
+        Members of each candidate with replicas.
     """
 
-    __slots__ = ("_heard_ns", "parts", "within_ns")
+    __slots__ = ("_heard_ns", "members", "parts", "within_ns")
 
-    def __init__(self, parts: Mapping[str, Collection[str]], within_ns: int) -> None:
+    def __init__(
+        self,
+        parts: Mapping[str, Collection[str]],
+        within_ns: int,
+        members: Mapping[str, Collection[str]] | None = None,
+    ) -> None:
         self.parts = FrozenDict({name: frozenset(mine) for name, mine in parts.items()})
         self.within_ns = within_ns
+        self.members = FrozenDict(members or {})
         self._heard_ns: dict[str, int] = {}
 
     def __repr__(self) -> str:
@@ -531,8 +539,9 @@ class Presence:
         if its last sign of life is younger than g - 1 periods.
         """
         period_ns = problem.pipeline.period_ns
-        parts = {name: parts_of(problem, name) for name in problem.candidates}
-        return cls(parts, max(problem.controller.guard_cycles - 1, 1) * period_ns)
+        parts = {name: parts_of(problem, name) for name in problem.plain_candidates}
+        members = {name: one.members for name, one in problem.replicas.items()}
+        return cls(parts, max(problem.controller.guard_cycles - 1, 1) * period_ns, members)
 
     def heard(self, part: str, at_ns: int) -> None:
         """Record a sign of life."""
@@ -547,7 +556,12 @@ class Presence:
         self._heard_ns.clear()
 
     def missing(self, candidate: str, now_ns: int) -> frozenset[str]:
-        """Return the parts of a candidate without a recent sign of life."""
+        """Return the parts of a candidate without a recent sign of life.
+
+        The parts of replicas are the parts of the member that lacks fewest.
+        """
+        if candidate in self.members:
+            return min((self.missing(name, now_ns) for name in self.members[candidate]), key=len)
         since_ns = now_ns - self.within_ns
         heard_ns = self._heard_ns
         return frozenset(
@@ -611,8 +625,9 @@ class Failures:
 class Probation:
     """Permission for an order to leave the fallback: h probes through the wanted placement.
 
-    A *probe* is the shadow of a cycle through the wanted placement. Every cycle has a probe while
-    the policy or a person wants to leave the fallback. Once h probes have completed, the placement
+    A *probe* is the shadow of a cycle through the wanted placement, or through a member of wanted
+    replicas (see `CellGuard.probed`). Every cycle has a probe while the policy or a person wants to
+    leave the fallback. Once h probes have completed, the placement
     is *proven* as long as it stays wanted. If the probe after the newest completed one becomes as
     old as the patience, counting restarts, because the guard would have fired.
 
@@ -783,6 +798,13 @@ class CellGuard(Guard):
         self.presence, self.failures = Presence.of(problem), Failures.of(problem)
         self.probation = Probation.of(problem)
 
+    @property
+    def probed(self) -> str | None:
+        """Candidate of the probes: the wanted one, or the first of its members not in force."""
+        wanted = self.probation.wanted
+        members = self.presence.members.get(wanted or "", ())
+        return next((name for name in members if name != self.placement), wanted)
+
     def sent(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Record the release of a cycle through a candidate; a cycle without a sink is idle."""
         is_idle = all(cycle % rate for rate in self._sink_rates)
@@ -793,7 +815,7 @@ class CellGuard(Guard):
     def shadow_sent(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Record the release of the shadow of a cycle through a candidate."""
         self.failures.released(candidate, cycle, at_ns)
-        if candidate == self.probation.wanted:
+        if candidate == self.probed:
             self.probation.released(cycle, at_ns)
 
     def arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
@@ -819,7 +841,7 @@ class CellGuard(Guard):
     def shadow_arrived(self, cycle: int, at_ns: int, candidate: str) -> None:
         """Record the completion of a shadow through a candidate."""
         self.failures.completed(candidate, cycle)
-        if candidate == self.probation.wanted:
+        if candidate == self.probed:
             self.probation.completed(cycle, at_ns)
 
     def look(self, now_ns: int) -> str | None:

@@ -144,9 +144,8 @@ class CellMetrics(Collector):
     def _samples(self) -> dict[str, Samples]:
         now, problem = self._observer.now(), self._problem
         health, placement = now.status["health"], now.placement
-        placed: Mapping[str, str] = (
-            problem.candidates[placement].first if placement in problem.candidates else {}
-        )
+        placed = problem.candidates.get(placement or "")
+        sites = () if placed is None else placed.sites
         # Ignore the old status if the controller does not answer.
         status: Mapping[str, Any] = {} if health == "absent" else now.status
         window, moves, processes, stages, flows = (
@@ -187,10 +186,8 @@ class CellMetrics(Collector):
                 if name in (*problem.fabric.nodes, CONTROLLER)
             ],
             "dwell_certificate_expiry_timestamp_seconds": self._certificates(),
-            "dwell_placement": [({"placement": placement}, 1)] if placed else [],
-            "dwell_task_placement": [
-                ({"task": task, "node": node}, 1) for task, node in placed.items()
-            ],
+            "dwell_placement": [({"placement": placement}, 1)] if sites else [],
+            "dwell_task_placement": [({"task": task, "node": node}, 1) for task, node in sites],
             "dwell_cycles": [
                 ({"outcome": one}, now.cycles.get(one, 0)) for one in OUTCOMES if now.cycles
             ],

@@ -326,13 +326,10 @@ class Meter:
             rows = [[-1 if part is None else self._number[part] for part in own]]
             shared = [[False] * len(message_columns(problem, here))]
             for there in self._placements:
-                if problem.replicas:
-                    # A cell with replicas has no shadows.
-                    rows, shared = [*rows, [-1] * len(own)], [*shared, shared[0]]
-                    continue
-                apart = pipeline.diverging(here.first, there.first)
+                apart = pipeline.diverging(here, there.first)
                 rows.append(self._columns(there.first, apart))
-                shared.append([flow.source not in apart for flow in pipeline.flows])
+                columns = [flow.source not in apart for flow in pipeline.flows]
+                shared.append([*columns, *[False] * (len(shared[0]) - len(columns))])
             self._layouts[active] = CyclesLayout(
                 self._sources(here),
                 np.array(rows, np.int64),
@@ -352,17 +349,22 @@ class Meter:
 
     def _columns(self, placement: Copy, tasks: Collection[str]) -> list[int]:
         """Return the part of each task in `tasks`, then of each flow to them; -1 for others."""
-        parts: list[Part | None] = [
+        sites: list[Part | None] = [
             Site(name, placement[name]) if name in tasks else None for name in self._pipeline.tasks
         ]
         # No shadow gets the sampled messages of shared jobs.
-        parts += [
+        messages: list[Part | None] = [
             message_of(flow.source, flow.target, placement)
             if flow.target in tasks and (flow.source in tasks or not flow.sampled)
             else None
             for flow in self._pipeline.flows
         ]
-        return [-1 if part is None else self._number[part] for part in parts]
+        # A shadow has no second copies.
+        found = [
+            [*parts, *[None] * len(parts)] if self._problem.replicas else parts
+            for parts in (sites, messages)
+        ]
+        return [-1 if part is None else self._number[part] for parts in found for part in parts]
 
 
 def _shares_evenly(node: Node, shared: Collection[str]) -> bool:

@@ -31,7 +31,7 @@ from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.qos import NO_ERROR, QoS, unchecked_qos
-from dwell.model.shadow_plan import by_candidate
+from dwell.model.shadow_plan import alternatives, by_candidate
 
 #: Simulated steps after a change of conditions; the first fills the queues.
 FIRST_STEPS = 6
@@ -382,15 +382,16 @@ class Online(CellEstimator):
 
     def _sent_under(self, name: str) -> Mapping[str, float]:
         """Return the share of each resource that shadow jobs take under a candidate."""
-        problem, here = self.problem, self.problem.candidates[name].first
+        problem, placed = self.problem, self.problem.candidates
+        here, names = placed[name], [*placed]
         pipeline, resources = problem.pipeline, problem.fabric.resources
         fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
         share, rates = dict.fromkeys(resources, 0.0), pipeline.rates
-        for there in (placement.first for placement in problem.candidates.values()):
+        for there in (placed[names[i]].first for i in alternatives(placed)[names.index(name)]):
             apart = pipeline.diverging(here, there)
             # In the order of tasks: the order of a set, and the rounding of the sum, may differ.
             for task in pipeline.tasks:
-                if there is here or task not in apart or not pipeline.outputs(task):
+                if task not in apart or not pipeline.outputs(task):
                     continue
                 execution = pipeline.tasks[task].on[there[task]]
                 resource = execution.resource(there[task])

@@ -13,12 +13,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.estimators.measured import Message, message_of, parts_of_copy, sending_ns
+from dwell.estimators.measured import Message, message_of, parts_of, sending_ns
 from dwell.kernels.random_draws import draw_shadows
 from dwell.kernels.realisation import Realisation
-from dwell.model.placement import Copy
+from dwell.model.placement import Copy, Placement
 from dwell.model.problem import Problem
-from dwell.model.shadow_plan import ShadowFraction, ShadowPlan, by_candidate
+from dwell.model.shadow_plan import ShadowFraction, ShadowPlan, alternatives, by_candidate
 
 #: Share of D for which a shadow may occupy links of own messages and still count as harmless.
 NEGLIGIBLE = 0.002
@@ -35,7 +35,8 @@ class SentShadows:
         self, problem: Problem, realisation: Realisation, fraction: ShadowFraction
     ) -> None:
         fractions = by_candidate(fraction, problem.candidates)
-        self._plan = ShadowPlan(0, realisation.cycles, [*fractions.values()])
+        others = alternatives(problem.candidates)
+        self._plan = ShadowPlan(0, realisation.cycles, [*fractions.values()], others)
         self._hindered = [name in hindered(problem) for name in problem.candidates]
         self.realisation = draw_shadows(problem, realisation, self._plan.sent, wraps=True)
 
@@ -52,17 +53,15 @@ class SentShadows:
 @lru_cache(maxsize=64)
 def hindered(problem: Problem) -> frozenset[str]:
     """Return the candidates whose own jobs may have to wait for shadows."""
+    placed, others = [*problem.candidates.values()], alternatives(problem.candidates)
     return frozenset(
         name
-        for name, here in problem.plain_candidates.items()
-        if any(
-            _is_hindered(problem, here.first, there.first)
-            for there in problem.plain_candidates.values()
-        )
+        for name, here, row in zip(problem.candidates, placed, others, strict=True)
+        if any(_is_hindered(problem, here, placed[i].first) for i in row)
     )
 
 
-def _is_hindered(problem: Problem, here: Copy, there: Copy) -> bool:
+def _is_hindered(problem: Problem, here: Placement, there: Copy) -> bool:
     """Return whether own jobs may wait if cycles are also sent through another candidate.
 
     They may if shadow messages use an own link that keeps messages in order, if shadow messages
@@ -71,7 +70,7 @@ def _is_hindered(problem: Problem, here: Copy, there: Copy) -> bool:
     """
     pipeline, links = problem.pipeline, problem.fabric.links
     apart = pipeline.diverging(here, there)
-    own_links = {part.link for part in parts_of_copy(pipeline, here) if isinstance(part, Message)}
+    own_links = {part.link for part in parts_of(pipeline, here) if isinstance(part, Message)}
     held_ns = 0.0
     for flow in pipeline.flows:
         # A shadow job sends its sampled outputs; a shared job sends none to the shadow.
@@ -84,7 +83,8 @@ def _is_hindered(problem: Problem, here: Copy, there: Copy) -> bool:
     if held_ns > NEGLIGIBLE * pipeline.deadline_ms * 1e6:
         return True
     shadowed = [name for name in apart if pipeline.outputs(name)]
-    return not _scarce(problem, here, pipeline.tasks).isdisjoint(_scarce(problem, there, shadowed))
+    own = set[str]().union(*(_scarce(problem, copy, pipeline.tasks) for copy in here.copies))
+    return not own.isdisjoint(_scarce(problem, there, shadowed))
 
 
 def _scarce(problem: Problem, placement: Copy, tasks: Iterable[str]) -> set[str]:

@@ -52,10 +52,31 @@ i64 heard_ns(const S& s, i64 cell, i64 cycle, i64 task) {
   return kLastNs;
 }
 
-// Marks what was cancelled in a cycle with replicas that is done: it shows no loss.
+// Whether the message of a flow has arrived in any of some cycles.
 template <class S>
-void mark_cancelled(const S& s, i64 cell, i64 cycle, i64 n_tasks, const i64* flows, i64 n_flows,
-                    i64* ready_ns) {
+bool has_arrived(const S& s, i64 cell, i64 begin, i64 end, i64 flow) {
+  for (i64 cycle = begin; cycle < end; ++cycle) {
+    if (s.log_arrived[s.log_row(cell, cycle) * s.n_flows + flow] >= 0) return true;
+  }
+  return false;
+}
+
+// Instant from which the message of a flow may be sent, if its sender completes at `end_ns`.
+template <class S>
+i64 sent_ns(const S& s, i64 cell, i64 cycle, i64 flow, i64 end_ns) {
+  const i64 candidate = s.cell(cell).candidate_0 + s.stamp(cell, cycle);
+  const i64 source = s.flow(cell, flow).source;
+  const bool is_held =
+      flow >= s.cell(cell).flow_copies && s.site_of[candidate * s.n_tasks + source] < 0;
+  const i64 due_ns = later(s.cell(cell).release_ns[cycle], s.after_ns[candidate]);
+  return is_held && end_ns < due_ns ? due_ns : end_ns - 1;
+}
+
+// Marks what was cancelled in a cycle with replicas that is done: it shows no loss. A message that
+// could be repeated was cancelled if one of a later cycle before `end` has arrived.
+template <class S>
+void mark_cancelled(const S& s, i64 cell, i64 cycle, i64 end, i64 n_tasks, const i64* flows,
+                    i64 n_flows, i64* ready_ns) {
   const i64 candidate = s.cell(cell).candidate_0 + s.stamp(cell, cycle);
   if (s.after_ns[candidate] < 0 || s.outcome[s.output(cell, cycle)] != kDone) return;
   i64 *end_ns = ready_ns + n_tasks, *arrived_ns = end_ns + n_tasks;
@@ -67,8 +88,11 @@ void mark_cancelled(const S& s, i64 cell, i64 cycle, i64 n_tasks, const i64* flo
     if (s.site_of[candidate * s.n_tasks + source] < 0) source -= copies;
     const i32 hop = s.route[candidate * s.n_flows + flows[i]];
     const bool may_repeat = hop < 0 || s.links[s.hops[hop].link].retransmit_ns >= 0;
-    const bool is_stopped = end_ns[source] >= heard_ns(s, cell, cycle, source);
-    if (may_repeat || is_stopped) arrived_ns[i] = kNotDue;
+    const i64 from_ns = sent_ns(s, cell, cycle, flows[i], end_ns[source]);
+    if (from_ns >= heard_ns(s, cell, cycle, source) ||
+        (may_repeat && has_arrived(s, cell, cycle + 1, end, flows[i]))) {
+      arrived_ns[i] = kNotDue;
+    }
   }
   for (i64 task = 0; task < n_tasks; ++task) {
     const bool is_lost = s.log_outcome[s.log_entry(cell, cycle, task)] != kInFlight;
@@ -119,9 +143,11 @@ DWELL_EXPORT void dwell_logged_window(const Tables* tables, i64 cell_0, i64 n_ce
         beside += 2;
       }
       for (i64 i = 0; i < n_flows; ++i) arrived_ns[i] = s.log_arrived[row * s.n_flows + flows[i]];
-      if (tables->clock[0].has_rates && cell == cell_0) {
+      if (tables->clock[0].has_rates) {
         mark_undue(s, cell, cycle, n_tasks, flows, n_flows, out);
-        mark_cancelled(s, cell, cycle, n_tasks, flows, n_flows, out);
+        if (cell == cell_0) {
+          mark_cancelled(s, cell, cycle, first + n, n_tasks, flows, n_flows, out);
+        }
       }
       out = start_ns + n_tasks;
     }

@@ -637,8 +637,10 @@ class _Layout:
     def _add_pairs(self, problem: Problem) -> None:
         """Add the roles of the tasks for a shadow, by pair of candidates."""
         for active, other in itertools.product(problem.candidates.values(), repeat=2):
-            parts = shadow_parts(problem.pipeline, active.first, other.first)
-            self.shadow_parts.append(parts + [ShadowPart.SHARED] * (self.max_tasks - len(parts)))
+            parts = shadow_parts(problem.pipeline, active, other.first)
+            # No shadow shares the jobs of second copies.
+            parts += [ShadowPart.DISCARDED] * (self.max_tasks - len(parts))
+            self.shadow_parts.append(parts)
 
     def _add_shadow(
         self, index: int, problem: Problem, real: Realisation, link_row: Mapping[str, int]
@@ -1009,11 +1011,11 @@ def flow_columns(problem: Problem) -> Ints:
     return np.concatenate([rows, rows + len(rows)]) if problem.replicas else rows
 
 
-def shadow_parts(pipeline: Pipeline, active: Copy, other: Copy) -> list[ShadowPart]:
+def shadow_parts(pipeline: Pipeline, active: Placement, other: Copy) -> list[ShadowPart]:
     """Role of each task for the shadow, sent through `other`, of a cycle that runs under `active`.
 
-    A task is shadowed if it, or any task before it, runs on another node; a sink behind such tasks
-    discards its inputs. All other tasks are shared: their outputs are sent twice.
+    A task is shadowed if it, or any task before it, runs on another node or has two copies; a sink
+    behind such tasks discards its inputs. All other tasks are shared: their outputs are sent twice.
     """
     diverging = pipeline.diverging(active, other)
     return [

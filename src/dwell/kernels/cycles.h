@@ -254,6 +254,28 @@ i32 sent_by(const S& s, i64 cell, i64 cycle, const Task& from) {
       flows, flows + from.n_out, [&](i32 flow) { return s.is_due(s.flow(cell, flow), cycle); }));
 }
 
+// Sends the outputs of a common task to second copies of tasks, or holds them until `after_ns`.
+template <class S>
+[[gnu::noinline]] void send_to_second(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
+  const Cell& of = s.cell(cell);
+  const Task& from = s.task(cell, task + of.copies);
+  const i64 after_ns = s.after_ns[s.slot(cell, cycle).candidate];
+  const i64 due_ns = later(of.release_ns[cycle], after_ns);
+  for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
+    const i64 flow = s.outputs[i];
+    if (s.job(cell, cycle, s.flow(cell, flow).target).site < 0) continue;
+    s.slot(cell, cycle).live += 1;
+    if (now < due_ns) {
+      attempts_of(s, cell, cycle, flow) = kIsHeld;
+      s.post(due_ns, make_key(kRetry, cell, cycle, flow));
+    } else if (const i64 hop = s.hop(cell, cycle, flow); hop < 0) {
+      hand_over(s, cell, cycle, flow, now);
+    } else {
+      send(s, cell, cycle, flow, hop, 0, now);
+    }
+  }
+}
+
 // Hands a job's outputs over to tasks on its node, and sends the others.
 template <class S>
 void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
@@ -263,6 +285,7 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   }
   // A shadow receives the outputs of shared tasks too, after the cycle's own outputs.
   const i64 shadow = shared_by(s, cell, cycle, task);
+  const bool sends_twice = has_replicas(s, cell, cycle) && is_common(s, cell, cycle, task);
   i64 to = cell;
   while (true) {
     for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
@@ -285,30 +308,9 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
         send(s, to, cycle, flow, hop, 0, now);
       }
     }
+    if (sends_twice && to == cell) send_to_second(s, cell, cycle, task, now);
     if (shadow < 0 || to != cell) return;
     to = shadow;
-  }
-}
-
-// Sends the outputs of a common task to second copies of tasks, or holds them until `after_ns`.
-template <class S>
-[[gnu::noinline]] void send_to_second(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
-  const Cell& of = s.cell(cell);
-  const Task& from = s.task(cell, task + of.copies);
-  const i64 after_ns = s.after_ns[s.slot(cell, cycle).candidate];
-  const i64 due_ns = later(of.release_ns[cycle], after_ns);
-  for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
-    const i64 flow = s.outputs[i];
-    if (s.job(cell, cycle, s.flow(cell, flow).target).site < 0) continue;
-    s.slot(cell, cycle).live += 1;
-    if (now < due_ns) {
-      attempts_of(s, cell, cycle, flow) = kIsHeld;
-      s.post(due_ns, make_key(kRetry, cell, cycle, flow));
-    } else if (const i64 hop = s.hop(cell, cycle, flow); hop < 0) {
-      hand_over(s, cell, cycle, flow, now);
-    } else {
-      send(s, cell, cycle, flow, hop, 0, now);
-    }
   }
 }
 
@@ -332,9 +334,7 @@ void complete(S& s, i64 key, i64 now) {
     s.slot(cell, cycle).live -= 1;
   } else {
     job.network_ns = now - job.network_ns;
-    const bool sends_twice = has_replicas(s, cell, cycle) && is_common(s, cell, cycle, task);
     send_outputs(s, cell, cycle, task, now);
-    if (sends_twice) send_to_second(s, cell, cycle, task, now);
   }
 }
 

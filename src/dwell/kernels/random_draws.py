@@ -6,9 +6,11 @@ import hashlib
 import math
 import os
 import struct
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import product
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +38,9 @@ from dwell.model.instants import HORIZON_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.placement import Copy
 from dwell.model.scenario import RAMP_STEPS
+
+#: A flow's source and target, and the link of its message.
+Hop: TypeAlias = tuple[str, str, str]
 
 NS_PER_MS = 1e6
 NS_PER_S = 1e9
@@ -122,7 +127,7 @@ def _require_memory(problem: Problem, windows: int) -> None:
     """Refuse a run whose arrays are larger than this computer's memory."""
     pipeline = problem.pipeline
     sites = sum(len(task.on) for task in pipeline.tasks.values())
-    columns = OF_A_CYCLE + sites + len(_hops(problem)) + len(pipeline.scales)
+    columns = OF_A_CYCLE + sites + len(tuple(_hops(problem))) + len(pipeline.scales)
     cycles = problem.cycles_of(windows)
     needed = 8 * columns * cycles
     memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -304,7 +309,7 @@ class Drawing:
         self.sent: Ints | None = None
         tasks = problem.pipeline.tasks
         self.sites = tuple((task, node) for task in tasks for node in tasks[task].on)
-        self.hops = tuple(_possible_hops(problem)) if every_hop else _hops(problem)
+        self.hops = tuple(_hops(problem, of_any=every_hop))
         #: Shadow jobs bring no values, so nothing of theirs is forwarded.
         self.forwards = () if shadow else tuple(_forwards(problem))
         #: Link of each hop and forward, with the prefix and the end of the names of its streams.
@@ -667,7 +672,7 @@ def _rates(own_mbps: float, mbps: float) -> Floats:
     return rates
 
 
-def _hop_name(hop: tuple[str, str, str]) -> str:
+def _hop_name(hop: Hop) -> str:
     source, target, link = hop
     return f"{link}/{source}->{target}"
 
@@ -678,54 +683,52 @@ def _placements(problem: Problem) -> Iterator[Copy]:
         yield from placement.copies
 
 
-def _hops(problem: Problem) -> tuple[tuple[str, str, str], ...]:
-    """Return flows with the links that they use in some candidate, by flow, then by link."""
-    hops: dict[tuple[str, str, str], None] = {}
+def _hops(problem: Problem, *, of_any: bool = False) -> Iterator[Hop]:
+    """Yield flows with the links that they use in some candidate, by flow, then by link.
+
+    With `of_any`, yield the links that they can use in any placement. Else the state of tasks
+    follows, as a flow from a task to itself: cold and warm migrations have the same realisation.
+    """
+    tasks = problem.pipeline.tasks
     for flow in problem.pipeline.flows:
-        crossed = {
-            f"{placement[flow.source]}->{placement[flow.target]}"
-            for placement in _placements(problem)
-        }
-        for link in problem.fabric.links:
-            if link in crossed:
-                hops[flow.source, flow.target, link] = None
-    # Always add the hops of states: cold and warm migrations then have the same realisation.
-    return (*hops, *_state_hops(problem))
+        source, target = flow.source, flow.target
+        if of_any:
+            yield from _over(problem, source, target, product(tasks[source].on, tasks[target].on))
+        else:
+            used = ((placed[source], placed[target]) for placed in _placements(problem))
+            yield from _over(problem, source, target, used)
+    if not of_any:
+        for name, task in tasks.items():
+            if task.state_bytes > 0:
+                yield from _over(problem, name, name, _host_pairs(problem, name))
 
 
-def _forwards(problem: Problem) -> Iterator[tuple[str, str, str]]:
+def _forwards(problem: Problem) -> Iterator[Hop]:
     """Yield sampled flows with the links between nodes of their targets, by flow, then by link."""
     for flow in problem.pipeline.flows:
-        if not flow.sampled:
-            continue
-        hosts = {placement[flow.target] for placement in _placements(problem)}
-        for link in problem.fabric.links.values():
-            if {link.source, link.target} <= hosts:
-                yield flow.source, flow.target, link.name
+        if flow.sampled:
+            pairs = _host_pairs(problem, flow.target)
+            yield from _over(problem, flow.source, flow.target, pairs)
 
 
-def _hop_rates(problem: Problem, hops: Sequence[tuple[str, str, str]]) -> list[int]:
+def _host_pairs(problem: Problem, task: str) -> Iterable[tuple[str, str]]:
+    """Return the pairs of nodes that candidates give a task."""
+    hosts = {placed[task] for placed in _placements(problem)}
+    return product(hosts, hosts)
+
+
+def _over(
+    problem: Problem, source: str, target: str, pairs: Iterable[tuple[str, str]]
+) -> Iterator[Hop]:
+    """Yield a flow with each link that leads between a pair of nodes."""
+    ends = set(pairs)
+    for link in problem.fabric.links.values():
+        if (link.source, link.target) in ends:
+            yield source, target, link.name
+
+
+def _hop_rates(problem: Problem, hops: Sequence[Hop]) -> list[int]:
     """Return the cycles from one message of each hop to its next; 1 for states."""
     pipeline = problem.pipeline
     rates = {(one.source, one.target): pipeline.message_rate(one) for one in pipeline.flows}
     return [rates.get((source, target), 1) for source, target, _ in hops]
-
-
-def _possible_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
-    """Yield flows with the links that they can use in any placement, by flow, then by link."""
-    tasks = problem.pipeline.tasks
-    for flow in problem.pipeline.flows:
-        for link in problem.fabric.links.values():
-            if link.source in tasks[flow.source].on and link.target in tasks[flow.target].on:
-                yield flow.source, flow.target, link.name
-
-
-def _state_hops(problem: Problem) -> Iterator[tuple[str, str, str]]:
-    """Yield the state of tasks with the links that it may use, as a flow from a task to itself."""
-    for name, task in problem.pipeline.tasks.items():
-        if task.state_bytes == 0:
-            continue
-        hosts = dict.fromkeys(placement[name] for placement in _placements(problem))
-        for link in problem.fabric.links.values():
-            if {link.source, link.target} <= hosts.keys():
-                yield name, name, link.name

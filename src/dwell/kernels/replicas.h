@@ -75,13 +75,31 @@ bool is_stopped(const S& s, i64 cell, i64 cycle, i64 flow) {
   return s.job(cell, cycle, end_of(s, cell, cycle, s.flow(cell, flow).source)).missing == kHeard;
 }
 
-// Announces to every node with jobs of a cycle that the cycle is done.
+// Whether a cycle that is done still needs a node: to send a message that has not been handed over,
+// or to run a second copy that waits for one.
+template <class S>
+bool is_left_on(const S& s, i64 cell, i64 cycle, i64 node) {
+  const i64 copies = s.cell(cell).flow_copies;
+  for (i64 flow = 0; flow < 2 * copies; ++flow) {
+    if (attempts_of(s, cell, cycle, flow) == kHandedOver) continue;
+    const i64 source = end_of(s, cell, cycle, s.flow(cell, flow).source);
+    const i64 target = end_of(s, cell, cycle, s.flow(cell, flow).target);
+    const bool waits = !is_common(s, cell, cycle, target);
+    if (flow >= copies && !waits && !is_second(s, cell, source)) continue;  // there is no message
+    const auto is_here = [&](i64 task) { return s.site(s.job(cell, cycle, task)).node == node; };
+    if (is_here(source) || (waits && is_here(target))) return true;
+  }
+  return false;
+}
+
+// Announces to the nodes that a cycle still needs that it is done.
 template <class S>
 void announce_done(S& s, i64 cell, i64 cycle, i64 now) {
   if (!has_replicas(s, cell, cycle) || s.slot(cell, cycle).live == 0) return;
   const i64* hear_ns = &s.hear_ns[s.slot(cell, cycle).candidate * s.n_tasks];
   for (i64 task = 0; task < s.cell(cell).n_tasks; ++task) {
     if (hear_ns[task] < 0) continue;
+    if (!is_left_on(s, cell, cycle, s.site(s.job(cell, cycle, task)).node)) continue;
     s.post(later(now, hear_ns[task]), make_key(kStart, cell, cycle, s.n_tasks + task));
   }
 }

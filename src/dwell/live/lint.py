@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from dwell.errors import Fault
+from dwell.live.wire.wiring import lagging_states
 from dwell.model import Problem
 
 
 def lint(problem: Problem) -> Iterator[Fault]:
-    """Yield settings that a live cell does not follow, or that reduce its performance.
+    """Yield settings that a live cell does not follow or refuses, or that reduce its performance.
 
     A cell without hosts and stages, which is only for the simulator, gets no warning.
     """
     if problem.live.hosts or any(task.run for task in problem.pipeline.tasks.values()):
         yield from _side_by_side(problem)
         yield from _early_closes(problem)
+        yield from lagging_states(problem)
 
 
 def _side_by_side(problem: Problem) -> Iterator[Fault]:

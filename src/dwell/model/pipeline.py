@@ -10,6 +10,7 @@ from dwell.model.declaration import declared, key
 from dwell.model.fabric import accelerator_name
 from dwell.model.frozen import FrozenDict, require_names, shortened
 from dwell.model.live import require_callable_name
+from dwell.model.placement import Nodes
 from dwell.model.process import Constant, Process
 from dwell.model.ros_topics import RosTopic
 from dwell.model.task_rates import rates_of
@@ -317,11 +318,11 @@ class Pipeline:
         """
         return self.rates[flow.source if flow.sampled else flow.target]
 
-    def diverging(self, active: Mapping[str, str], other: Mapping[str, str]) -> frozenset[str]:
+    def diverging(self, active: Mapping[str, Nodes], other: Mapping[str, str]) -> frozenset[str]:
         """Return the tasks on another node under `other`, and all tasks downstream of them.
 
         A shadow through `other` runs these tasks and shares the rest with the cycle under `active`.
-        Sampled flows do not count.
+        A task with two copies is always on another node. Sampled flows do not count.
         """
         found: set[str] = set()
         for name in self.topological():

@@ -65,6 +65,11 @@ class Placement(FrozenDict[str, Nodes]):
         return None
 
     @property
+    def sites(self) -> tuple[tuple[str, str], ...]:
+        """Task and node of each job of a cycle, those of the first copy first."""
+        return tuple(dict.fromkeys(site for copy in self.copies for site in copy.items()))
+
+    @property
     def nodes(self) -> frozenset[str]:
         """The nodes on which its tasks run."""
         return frozenset(node for copy in self.copies for node in copy.values())

@@ -108,7 +108,7 @@ class Problem(Displayed):
             raise ProblemError(faults)
         priced = self.fabric.has_prices or not self.objective.weighs_price
         bound = "0 in a cell without a link that has a price_per_gb"
-        require(priced, "weights.price", self.objective.weights.price, bound)
+        require(priced, "objective.weights.price", self.objective.weights.price, bound)
         self._require_due_sinks()
         self._require_supported_replicas()
 

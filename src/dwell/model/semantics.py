@@ -340,7 +340,10 @@ def _placed(parts: CellParts, path: str, moves: Mapping[str, str]) -> Iterator[F
     for task_name, node in moves.items():
         here = f"{path}.{task_name}"
         if task_name not in parts.tasks:
-            yield from _unknown(here, "task", task_name, parts.tasks)
+            if task_name == "replicas":
+                yield Fault(here, f"{node} is no list; name two candidates, as [LOC, SO]")
+            else:
+                yield from _unknown(here, "task", task_name, parts.tasks)
             continue
         task = parts.tasks[task_name]
         if task is None or node in task.on:

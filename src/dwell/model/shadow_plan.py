@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.model.frozen import FrozenDict
-from dwell.model.placement import Placement
+from dwell.model.placement import Placement, Replicas
 
 GOLDEN = (np.sqrt(5) - 1) / 2
 
@@ -20,16 +20,39 @@ ShadowFraction: TypeAlias = float | Mapping[str, float]
 def by_candidate(
     fraction: ShadowFraction, candidates: Mapping[str, Placement]
 ) -> FrozenDict[str, float]:
-    """Return the share of each alternative, by the active candidate; 0 in a cell with replicas."""
-    if any(placement.second is not None for placement in candidates.values()):
-        return FrozenDict(dict.fromkeys(candidates, 0.0))
-    if isinstance(fraction, Mapping):
-        return FrozenDict({name: fraction.get(name, 0.0) for name in candidates})
-    return FrozenDict(dict.fromkeys(candidates, fraction))
+    """Return the share of each alternative, by the active candidate.
+
+    Replicas whose members are the only other candidates have the share 0.
+    """
+    given = fraction if isinstance(fraction, Mapping) else dict.fromkeys(candidates, fraction)
+    return FrozenDict(
+        {
+            name: 0.0 if isinstance(placed, Replicas) and not others else given.get(name, 0.0)
+            for (name, placed), others in zip(
+                candidates.items(), alternatives(candidates), strict=True
+            )
+        }
+    )
+
+
+def alternatives(candidates: Mapping[str, Placement]) -> list[list[int]]:
+    """Return the indices of the candidates of shadows, by active candidate.
+
+    No shadow goes through replicas, nor through a member of replicas in force.
+    """
+    plain = {i: name for i, name in enumerate(candidates) if candidates[name].second is None}
+    return [
+        [i for i, name in plain.items() if name not in _members(active, placed)]
+        for active, placed in candidates.items()
+    ]
+
+
+def _members(name: str, placed: Placement) -> tuple[str, ...]:
+    return placed.members if isinstance(placed, Replicas) else (name,)
 
 
 def shadow_stamps(
-    first: int, last: int, active: int, candidates: int, fraction: float
+    first: int, last: int, others: Sequence[int], fraction: float
 ) -> NDArray[np.int16]:
     """Return the candidate that each cycle of a stretch is also sent through, -1 for none.
 
@@ -42,10 +65,8 @@ def shadow_stamps(
     ----------
     first, last : int
         Cycles, the last excluded.
-    active : int
-        Index of the candidate that the cycles run under.
-    candidates : int
-        Number of candidates.
+    others : sequence of int
+        Indices of the alternatives of the active candidate (see `alternatives`).
     fraction : float
         Share of the cycles that each alternative gets.
 
@@ -53,8 +74,7 @@ def shadow_stamps(
     -------
     int16 array, shape (last - first,)
     """
-    plan = ShadowPlan(first, last, [fraction] * candidates)
-    return plan.stamps(first, last, active)
+    return ShadowPlan(first, last, [fraction], [others]).stamps(first, last, 0)
 
 
 class ShadowPlan:
@@ -64,11 +84,17 @@ class ShadowPlan:
     ----------
     fractions : sequence of float
         Share of the cycles that each alternative gets, by the candidate that is active.
+    others : sequence of sequences of int
+        Indices of the alternatives, by the candidate that is active (see `alternatives`).
     """
 
-    def __init__(self, first: int, last: int, fractions: Sequence[float]) -> None:
+    def __init__(
+        self, first: int, last: int, fractions: Sequence[float], others: Sequence[Sequence[int]]
+    ) -> None:
         self._first, self._last, self._fractions = first, last, tuple(fractions)
-        self._none = max(len(self._fractions) - 1, 0)
+        self._none = max(map(len, others), default=0)
+        padded = [[*row, *[-1] * (self._none + 1 - len(row))] for row in others]
+        self._others = np.array(padded, np.int16)
         turned = np.arange(first, last) * GOLDEN
         turned -= np.floor(turned)
         #: Which alternative each cycle is sent through, by the share; the last stands for none.
@@ -84,18 +110,17 @@ class ShadowPlan:
 
     @property
     def sent(self) -> NDArray[np.int64]:
-        """Cycles with a shadow under the active candidate that sends most, ascending.
+        """Cycles with a shadow at the largest share and the most alternatives, ascending.
 
-        They include the cycles with a shadow under every other active candidate.
+        They include the cycles with a shadow under every active candidate.
         """
         most = self._places[max(self._fractions)]
         return self._first + np.flatnonzero(most < self._none)
 
     def stamps(self, first: int, last: int, active: int) -> NDArray[np.int16]:
         """Return the stamps of some of the cycles where they run under a candidate."""
-        alternatives = [i for i in range(len(self._fractions)) if i != active]
         place = self._places[self._fractions[active]]
-        stamps: NDArray[np.int16] = np.array([*alternatives, -1], np.int16)[
+        stamps: NDArray[np.int16] = self._others[active][
             place[first - self._first : last - self._first]
         ]
         return stamps

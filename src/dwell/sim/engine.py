@@ -30,6 +30,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.fabric import resources_of
 from dwell.model.progress import Progress
+from dwell.model.shadow_plan import alternatives
 from dwell.model.table_columns import require_apart
 from dwell.model.window_close import close_after_ns
 from dwell.record import Run
@@ -215,8 +216,6 @@ def play_cells(
     progress : callable, optional
         Receives the number of closed windows and the number of all windows.
     """
-    for cell in cells:
-        _require_no_guarded_replicas(cell)
     plans = [_shadow_plan(cell, shadow and cell.guarded) for cell in cells]
     whole = lay_out(
         [(cell.problem, cell.realisation) for cell in cells],
@@ -270,16 +269,9 @@ def _shadow_plan(cell: PlayedCell, probes: bool) -> ShadowPlan | None:
     """Return the plan of a cell's shadows, if it needs shadows."""
     if not (probes or cell.controller.sends_shadows):
         return None
-    return ShadowPlan(0, cell.realisation.cycles, [*cell.controller.shadow_fractions.values()])
-
-
-def _require_no_guarded_replicas(cell: PlayedCell) -> None:
-    """Refuse a guard in a cell with replicas."""
-    if cell.guarded and cell.problem.replicas:
-        raise SimulationError(
-            f"the guard does not support replicas ({', '.join(cell.problem.replicas)}); run "
-            f"{cell.problem.name} without the guard, or remove them"
-        )
+    fractions = cell.controller.shadow_fractions
+    others = alternatives(cell.problem.candidates)
+    return ShadowPlan(0, cell.realisation.cycles, [*fractions.values()], others)
 
 
 def _check_fit(problem: Problem, realisation: Realisation) -> None:

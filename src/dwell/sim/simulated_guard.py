@@ -287,7 +287,8 @@ class SimulatedGuard:
         """Send probes through the wanted candidate from the cycle `first` on."""
         if name != self.guard.probation.wanted:
             self.guard.probation.want(name, first)
-            self._probes[first:] = -1 if name is None else self.names.index(name)
+            probed = self.guard.probed
+            self._probes[first:] = -1 if probed is None else self.names.index(probed)
             self._probed = first
 
     def stamp(self, start: int, stop: int) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import dwell
-from dwell.live.roles.cycle_ledger import UNKNOWN, Ledger, LiveCycle
+from dwell.live.roles.cycle_ledger import NOT_DUE, UNKNOWN, Ledger, LiveCycle
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wire.messages import Completion, Hop, Stamp
 from dwell.model import Problem
@@ -150,6 +150,21 @@ def test_evidence_is_what_had_happened_at_the_close(ledger: Ledger, problem: Pro
     # Of one that never came, the first message to another node is taken to have been lost.
     assert found.cycles.end_ns[1, tasks.index("sensing")] == RELEASE_NS
     assert (found.cycles.arrived_ns[1] == UNKNOWN).all()
+
+
+def test_what_is_not_due_in_a_cycle_is_not_due_in_its_shadow(problem: Problem) -> None:
+    tasks = dict(problem.pipeline.tasks)
+    tasks["sensing"] = dataclasses.replace(tasks["sensing"], every=2)
+    pipeline = dataclasses.replace(problem.pipeline, tasks=tasks)
+    slow = dataclasses.replace(problem, pipeline=pipeline)
+    ledger = Ledger(slow, Offsets("E", problem.stamper_node, system_bound_ns=0))
+    both = [cycle(number, shadow="LOC") for number in (0, 1)]
+    release_ns, close_ns = np.array([RELEASE_NS, RELEASE_NS]), RELEASE_NS + 20 * MS
+    found = ledger.evidence(both, release_ns, close_ns, shadows=True)
+    assert found.shadows is not None
+    for instants in (found.shadows.end_ns, found.shadows.arrived_ns):
+        assert (instants[0] == UNKNOWN).all()
+        assert (instants[1] == NOT_DUE).all()
 
 
 def test_work_on_an_accelerator_is_the_time_that_a_job_had_it(problem: Problem) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import ClassVar
@@ -20,6 +21,7 @@ from dwell.live.wire.messages import Beat, Header, Snapshot, Stamp, decode, enco
 from dwell.live.wire.routing import STAMPER
 from dwell.live.wire.transport import Arrival, Receive
 from dwell.model import Problem
+from tests.live.replicated_cells import replicated
 from tests.live.small_world import MS, Bench, Counting, Passing, World, canonical, stateful
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -221,6 +223,45 @@ def test_a_worker_s_beats_go_on_while_its_stage_writes_its_state(problem: Proble
     assert key not in wire.put_keys
     stage.released.set()
     wait_until(lambda: key in wire.put_keys and not wire.beats[-1].moving)
+    stopped.set()
+    thread.join()
+
+
+class Blocked(Passing):
+    """A stage whose second job takes until it is released."""
+
+    def __init__(self) -> None:
+        super().__init__("sensing")
+        self.jobs, self.released = 0, threading.Event()
+
+    def process(self, inputs: Mapping[str, Message]) -> Message:
+        self.jobs += 1
+        if self.jobs == 2:
+            self.released.wait(PATIENCE_S)
+        return super().process(inputs)
+
+
+def test_a_held_message_is_sent_while_the_stage_works() -> None:
+    wire, stage = Wire(), Blocked()
+    place = RolePlace(replicated(after_ms=20), "sensing@R1", "R1", wire)
+    worker = Worker(place, "sensing", stage)
+    key = place.keys.of(channels.INPUT, "sensing", "R1", "main")
+    begin_ns = time.monotonic_ns()
+    for cycle in (1, 2):
+        stamp = Stamp(1, cycle, 1, "BOTH", begin_ns + cycle * MS)
+        head = encode(Header(stamp, STAMPER, "R1", "none"))
+        worker.receive(Arrival(key, b"", head), begin_ns)
+    stopped = threading.Event()
+    thread = threading.Thread(target=work, args=(worker, wire), kwargs={"stopped": stopped})
+    thread.start()
+    first, second = (
+        place.keys.of(channels.INPUT, "perception", node, "main") for node in ("R1", "E")
+    )
+    wait_until(lambda: second in wire.put_keys)
+    assert stage.jobs == 2
+    assert wire.put_keys.count(first) == 1
+    stage.released.set()
+    wait_until(lambda: wire.put_keys.count(second) == 2)
     stopped.set()
     thread.join()
 

@@ -150,7 +150,7 @@ def test_one_false_stamp_or_completion_ends_no_decisions(world: World, what: str
     """One of every kind, with time between them."""
     stamped(world, **FALSE[what](world))
     for outcome in ("actuated", "shadow", "replaced"):
-        windows_go_on(world)
+        world.run(700)
         completed(world, outcome, **FALSE[what](world))
     goes_on(world)
     assert world.cell.guard_moves == 0

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 import dwell
 from dwell.errors import LiveError
 from dwell.live.wire.messages import Stamp
 from dwell.live.wire.routing import STAMPER, Destination, Routes
-from dwell.model import Problem
+from dwell.model import Problem, Replicas
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +72,33 @@ def test_inputs_are_forked_to_where_a_state_goes(problem: Problem) -> None:
     )
     impossible = stamp("LOC", forks=(("planning", "R1"),))
     assert len(routes.destinations("perception", impossible)) == 1
+
+
+def test_each_copy_of_a_cycle_stays_within_its_own_placement(problem: Problem) -> None:
+    members = {name: problem.candidates[name] for name in ("LOC", "SO")}
+    both = Replicas(members, after_ms=10)
+    routes = Routes(replace(problem, candidates={**problem.candidates, "BOTH": both}))
+    known, twice = stamp("BOTH"), (("perception", "R1"), ("perception", "E"))
+    assert routes.destinations(STAMPER, known) == (Destination("sensing", "R1", "main"),)
+    # A common task sends to both copies, and holds the messages that only the second one gets.
+    assert routes.destinations("sensing", known, "R1") == tuple(
+        Destination(*to, "main", after_ns)
+        for to, after_ns in zip(twice, (0, 10_000_000), strict=True)
+    )
+    for node, target in {"R1": "R2", "E": "E"}.items():
+        found = routes.destinations("perception", known, node)
+        assert found == (Destination("planning", target, "main"),)
+        assert routes.runs("perception", node, known)
+    for node in ("R2", "E"):
+        assert routes.destinations("planning", known, node) == (
+            Destination("control", "R2", "main"),
+        )
+    # A state leaves from the first copy.
+    forked = stamp("BOTH", forks=(("planning", "R1"), ("planning", "R2")))
+    assert routes.destinations("perception", forked, "E") == (Destination("planning", "E", "main"),)
+    assert routes.destinations("perception", forked, "R1") == (
+        Destination("planning", "R2", "main"),
+    )
 
 
 def test_an_unknown_candidate_says_that_cell_files_differ(problem: Problem) -> None:

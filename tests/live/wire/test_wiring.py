@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import dwell
 from dwell.errors import LiveError
 from dwell.live.wire.wiring import (
     IMAGE_BYTES,
@@ -35,6 +36,7 @@ from dwell.model import (
     Node,
     Placement,
     Problem,
+    Replicas,
     Task,
 )
 from tests.cells.generated import make_problem, random_problem
@@ -290,3 +292,24 @@ def test_any_cell_is_wired_without_clashes(seed: int) -> None:
         # Who comes later connects, so that nobody waits for two to find each other.
         assert rank[source] > rank[target]
         assert wiring.entry(target).listen[session] in wiring.entry(source).connect[session]
+
+
+@pytest.mark.parametrize(("after_ms", "state_bytes"), [(10.0, 0), (0.0, 9), (10.0, 9)])
+def test_states_of_a_later_second_copy_are_refused(after_ms: float, state_bytes: int) -> None:
+    problem = dwell.load("examples/live/cell.yaml")
+    tasks = dict(problem.pipeline.tasks)
+    tasks["planning"] = replace(tasks["planning"], state_bytes=state_bytes)
+    members = {name: problem.candidates[name] for name in ("LOC", "SO")}
+    candidates = {**problem.candidates, "BOTH": Replicas(members, after_ms)}
+    pipeline = replace(problem.pipeline, tasks=tasks)
+    problem = replace(problem, pipeline=pipeline, candidates=candidates)
+    if after_ms and state_bytes:
+        with pytest.raises(
+            LiveError, match=r"candidates.BOTH.after_ms: 10 .*R2 and E.*set it to 0"
+        ):
+            wire(problem)
+        return
+    # Workers of both copies get the completions of the sink.
+    connected = {frozenset((one.source, one.target)) for one in wire(problem).wires}
+    for who in ("camera@R1", "perception@E", "planning@E"):
+        assert frozenset((who, "sink.control@R2")) in connected

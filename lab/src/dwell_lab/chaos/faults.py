@@ -117,7 +117,8 @@ def _slow_links(problem: Problem) -> Iterator[Fault]:
     for link in problem.fabric.links.values():
         crossing = [
             flow.payload_bytes
-            for placement in problem.candidates.values()
+            for placed in problem.candidates.values()
+            for placement in placed.copies
             for flow in pipeline.flows
             if (placement[flow.source], placement[flow.target]) == (link.source, link.target)
         ]

@@ -364,7 +364,7 @@ class Harness(Started):
         while missing := event():
             if time.monotonic() > until:
                 raise LiveError(f"waited {patience_s:g} s for {what}: {missing}")
-            time.sleep(0.002)
+            time.sleep(0.01)
 
     def status(self) -> Mapping[str, Any]:
         """Return the controller's status, or an empty mapping if it does not answer."""

@@ -28,6 +28,7 @@ from dwell.live.wire.messages import (
     decode,
 )
 from dwell.model import Problem
+from dwell.model.placement import nodes_of
 from dwell.policies.registry import estimator_of
 from dwell_lab.chaos.actuations import Seen
 from dwell_lab.chaos.stages import APPLY, HOLD, ZERO
@@ -284,8 +285,8 @@ class Judge:
         candidate = self.problem.candidates.get(name)
         if candidate is None:
             yield f"{where}: {name!r} is no candidate"
-        elif candidate[task] != node and (shadow or (task, node) not in stamp.forks):
-            yield f"{where}: {name} has it on {candidate[task]}"
+        elif node not in nodes_of(candidate[task]) and (shadow or (task, node) not in stamp.forks):
+            yield f"{where}: {name} has it on {' and '.join(nodes_of(candidate[task]))}"
 
     def _feasible(self, task: str, node: str) -> bool:
         tasks: Mapping[str, object] = self.problem.pipeline.tasks
@@ -301,7 +302,9 @@ class Judge:
             where = f"cycle {stamp.cycle}: {hop.task} ran on {hop.node}"
             if not self._feasible(hop.task, hop.node):
                 yield f"{where}: infeasible"
-            elif stamp.term and candidate is not None and candidate[hop.task] != hop.node:
+                continue
+            placed = () if candidate is None else nodes_of(candidate[hop.task])
+            if stamp.term and placed and hop.node not in placed:
                 yield f"{where}, not where {stamp.placement} has it"
 
 

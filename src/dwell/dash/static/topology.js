@@ -150,15 +150,21 @@ export class Topology {
     const candidate = this.cell.candidates.find(({ name }) => name === state.placement);
     const words = [];
     for (const task of this.cell.tasks) {
-      const node = candidate?.nodes[task.name] ?? task.on[0];
+      // With replicas a task may run on two nodes; the stage is on the node of the first copy.
+      const nodes = [candidate?.nodes[task.name] ?? task.on[0]].flat();
+      const node = nodes[0];
       const [x, y, width] = this.slots.get(`${task.name}@${node}`);
       const group = this.stages.get(task.name);
       group.style.transform = `translate(${x}px, ${y}px)`;
       group.style.setProperty("--hue", candidate?.hue ?? "gray");
       group.dataset.node = node;
       group.firstChild.setAttribute("width", width);
-      for (const other of task.on) this.possible.get(`${task.name}@${other}`).classList.toggle("taken", other === node);
-      words.push(`${task.name} on ${node}`);
+      for (const other of task.on) {
+        const classes = this.possible.get(`${task.name}@${other}`).classList;
+        classes.toggle("taken", other === node);
+        classes.toggle("copy", other !== node && nodes.includes(other));
+      }
+      words.push(`${task.name} on ${nodes.join(" and ")}`);
     }
     const drained = new Set(state.drained ?? []);
     for (const [name, parts] of this.nodes) {

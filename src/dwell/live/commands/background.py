@@ -351,9 +351,9 @@ def _moved_off(visitor: OperatorClient, node: str) -> Iterator[None]:
     """Pin the candidate with the fewest stages on a node; restore the previous pin at the end."""
     status = visitor.ask("status")
     clear = {
-        name: [*placement.values()].count(node)
+        name: [there for _, there in placement.sites].count(node)
         for name, placement in visitor.problem.candidates.items()
-        if {*status["drained"]}.isdisjoint(placement.values())
+        if placement.nodes.isdisjoint(status["drained"])
     }
     target = min(clear, key=lambda name: (clear[name], name != status["placement"]))
     visitor.ask("pin", target)

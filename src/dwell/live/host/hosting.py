@@ -17,6 +17,7 @@ from dwell.live.stage import Message
 from dwell.live.wire.continuity import SetbackDetector
 from dwell.live.wire.transport import Arrival, Transport
 from dwell.model import Problem
+from dwell.model.instants import NEVER_NS
 
 Clock = Callable[[], int]
 
@@ -235,6 +236,9 @@ def _drain(
         ended_ns = clock()
         with hosted.lock:
             worker.finish(job, output, started_ns, ended_ns, state_age)
+        if worker.copies.due_ns < NEVER_NS:
+            # The thread of the beats sends held messages while this thread runs a job.
+            hosted.wake_now()
         note(None)
 
 

@@ -36,6 +36,7 @@ from dwell.live.wire.messages import (
 )
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
+from dwell.model.placement import nodes_of
 
 #: Time between two status requests to the stamper, and between two copies of an unanswered order.
 ASK_NS = 250_000_000
@@ -465,11 +466,13 @@ class ControlledCell:
         if self._move is not None:
             self._stay(self._overruled())
         problem = self.place.problem
-        old, new = (problem.candidates[one].first for one in (self.course.placement, name))
+        old, new = (problem.candidates[one] for one in (self.course.placement, name))
+        # A state moves, or is copied, to each node that is new to its task.
         forks = tuple(
-            (task.name, new[task.name])
+            (task.name, node)
             for task in problem.pipeline.tasks.values()
-            if task.state_bytes and old[task.name] != new[task.name]
+            for node in nodes_of(new[task.name])
+            if task.state_bytes and node not in nodes_of(old[task.name])
         )
         phase: Phase = "fork" if forks else "order"
         wish = "pinned" if self.pinned else "drained"
@@ -643,12 +646,12 @@ class ControlledCell:
 
     def _clear(self, name: str) -> bool:
         """Whether a candidate needs no node that is drained."""
-        return not self.drained.intersection(self.place.problem.candidates[name].values())
+        return not self.drained & self.place.problem.candidates[name].nodes
 
     def _workers_ready(self, name: str, now_ns: int) -> bool:
         """Whether all workers of a candidate have sent a recent beat and are ready."""
         detector, silent_ns = self.pulse.detector, silent_after_ns(self.place.problem)
-        workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].items()]
+        workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].sites]
         beats = [detector.last(who) for who in workers if detector.fresh(who, now_ns, silent_ns)]
         return len(beats) == len(workers) and all(beat is not None and beat.ready for beat in beats)
 
@@ -675,7 +678,7 @@ class ControlledCell:
             case "pin":
                 if ask.about not in problem.candidates:
                     return f"no candidate {ask.about!r}; there are {', '.join(problem.candidates)}"
-                if needed := self.drained.intersection(problem.candidates[ask.about].values()):
+                if needed := self.drained & problem.candidates[ask.about].nodes:
                     return f"{ask.about} needs {', '.join(sorted(needed))}, which is drained"
                 self.pinned = ask.about
             case "unpin":
@@ -709,9 +712,9 @@ class ControlledCell:
         if node not in problem.fabric.nodes:
             return f"no node {node!r}; there are {', '.join(problem.fabric.nodes)}"
         drained = {*self.drained, node}
-        if all(drained.intersection(p.values()) for p in problem.candidates.values()):
+        if all(drained & placed.nodes for placed in problem.candidates.values()):
             return f"every candidate needs {node}; nothing could run"
-        if self.pinned and node in problem.candidates[self.pinned].values():
+        if self.pinned and node in problem.candidates[self.pinned].nodes:
             return f"the cell is pinned to {self.pinned}, which needs {node}; unpin it first"
         self.drained = drained
         return ""

@@ -21,6 +21,8 @@ from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wire.messages import (
     ACTUATED,
     BEHIND,
+    CANCELLED,
+    LATE,
     NOT_APPLIED,
     SAMPLED,
     STALE,
@@ -34,10 +36,13 @@ from dwell.model.due_tasks import DueTasks
 from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
+from dwell.model.placement import Copy, Replicas
 from dwell.record import Values
 
 #: Whether the job belongs to the shadow; task and node.
 JobName: TypeAlias = tuple[bool, str, str]
+#: Task and node of a job.
+Site: TypeAlias = tuple[str, str]
 Jobs: TypeAlias = dict[JobName, Hop]
 
 UNKNOWN = -1
@@ -45,10 +50,12 @@ UNKNOWN = -1
 MAX_SHADOWS = 16
 #: Least share of a window in which a hook must have measured an accelerator.
 HOOKED_SHARE = 0.5
-#: Instant of a job or message in a cycle in which it is not due.
+#: Instant of a job or message in a cycle in which it is not due, or was cancelled.
 NOT_DUE = -2
 #: Outcomes of jobs that ended before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
+#: Outcomes of messages that begin no job whose output counts.
+WITHOUT_JOB = frozenset({SAMPLED, LATE, CANCELLED})
 
 
 class Shift(msgspec.Struct, frozen=True, gc=False):
@@ -85,10 +92,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         Completions by sink.
     heard_ns : dict of str to int
         Arrivals of the completions on the controller's clock, if known, by sink.
-    samples : dict of (str, str) to Completion
-        Reports of messages that have arrived at a task that samples them, by source and target.
-    replaced : dict of str to Completion
-        Reports of jobs that a newer cycle replaced, by task.
+    arrivals : dict of (str, str, str) to Completion
+        Reports of messages that have arrived where no job waits for them, and of cancelled jobs, by
+        source, target and its node.
+    replaced : dict of (str, str) to Completion
+        Reports of jobs that a newer cycle replaced, by task and node.
     latency_ns : int
         `NEVER_NS` until all sinks have reported.
     parts_ns : tuple of int, or None
@@ -125,8 +133,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     reports: dict[str, Completion] = {}
     heard_ns: dict[str, int] = {}
     shadows: tuple[Completion, ...] = ()
-    samples: dict[tuple[str, str], Completion] = {}
-    replaced: dict[str, Completion] = {}
+    arrivals: dict[tuple[str, str, str], Completion] = {}
+    replaced: dict[Site, Completion] = {}
     latency_ns: int = NEVER_NS
     parts_ns: tuple[int, int, int] | None = None
     bound_ns: int = 0
@@ -158,15 +166,15 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         """Reported jobs of this cycle, not of its shadow; several sinks may report one job."""
         for done in (*self.replaced.values(), *self.reports.values()):
             yield from done.hops
-        for done in self.samples.values():
-            yield from done.hops[:-1]
+        for done in self.arrivals.values():
+            yield from _ended(done)
 
     @property
     def all_reports(self) -> Iterator[Completion]:
         """Reports with jobs of this cycle, not of its shadow."""
         yield from self.reports.values()
         yield from self.replaced.values()
-        yield from self.samples.values()
+        yield from self.arrivals.values()
 
     @property
     def segment(self) -> tuple[int, int, str]:
@@ -187,11 +195,13 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
             if new:
                 self.shadows += (completion,)
             return new
-        if completion.outcome == SAMPLED:
-            flow = next(iter(_arrived(completion)), "")
-            return self.samples.setdefault((flow, completion.sink), completion) is completion
+        if completion.outcome in WITHOUT_JOB:
+            source = next(iter(_arrived(completion)), "")
+            key = source, completion.sink, completion.node
+            return self.arrivals.setdefault(key, completion) is completion
         if completion.outcome == REPLACED:
-            return self.replaced.setdefault(completion.sink, completion) is completion
+            site = completion.sink, completion.node
+            return self.replaced.setdefault(site, completion) is completion
         if completion.sink in self.reports:
             return False
         self.reports[completion.sink] = completion
@@ -210,6 +220,11 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         """Whether all known reports say that a command was applied."""
         reports = self.reports.values()
         return bool(reports) and all(done.outcome == ACTUATED for done in reports)
+
+    @property
+    def late_copies(self) -> int:
+        """Number of messages of its second copy to arrive that counted no more."""
+        return sum(done.outcome == LATE for done in self.arrivals.values())
 
     @property
     def silences(self) -> int:
@@ -277,6 +292,8 @@ class Ledger:
         self._sampled = {(f.source, f.target) for f in pipeline.flows if f.sampled}
         self._codes = {name: code for code, name in enumerate(problem.candidates)}
         self._every = frozenset(pipeline.tasks)
+        #: Columns per task and flow in the evidence.
+        self._copies = 2 if problem.replicas else 1
         order = pipeline.topological()
         self._forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
         self._apart: dict[tuple[str, str], frozenset[str]] = {}
@@ -284,7 +301,7 @@ class Ledger:
 
     def tells(self, completion: Completion) -> bool:
         """Whether a completion's task can have its outcome: before a sink any task, else a sink."""
-        early = completion.outcome in {SHADOW, REPLACED, SAMPLED}
+        early = completion.outcome in {SHADOW, REPLACED, *WITHOUT_JOB}
         return completion.sink in (self._every if early else self.sinks)
 
     # ------------------------------------------------------------------------ latency
@@ -295,7 +312,7 @@ class Ledger:
 
     def is_replaced(self, cycle: LiveCycle) -> bool:
         """Whether a later cycle has replaced a job that a due sink waits for."""
-        return any(self.due.is_needed(task, cycle.number) for task in cycle.replaced)
+        return any(self.due.is_needed(task, cycle.number) for task, _ in cycle.replaced)
 
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
         """Compute latency and parts of a complete cycle.
@@ -354,14 +371,14 @@ class Ledger:
         bounds, a clock was set after the last comparison.
         """
         known = [(done.node, done.done_ns)]
-        hops = {hop.task: hop for hop in done.hops}
+        hops = _by_site(done.hops)
         for hop in hops.values():
             if hop.ended_ns != UNKNOWN:
                 known.append((hop.node, hop.ended_ns))
                 if hop.ended_ns < hop.arrived_ns:
                     self._disbelieve(cycle, hop.node)
             for source, arrived_ns in hop.inputs:
-                sender = hops.get(source)
+                sender = self._sender(cycle, hops, hop, source)
                 is_flow = (source, hop.task) in self._flows
                 if sender is None or sender.ended_ns == UNKNOWN or not is_flow:
                     continue
@@ -403,21 +420,40 @@ class Ledger:
         )
         return begin_ns, end_ns
 
+    def _sender(
+        self, cycle: LiveCycle, hops: Mapping[Site, Hop], hop: Hop, source: str
+    ) -> Hop | None:
+        """Return the job that sent an input of a job, of the same copy if there are two."""
+        for copy in self._candidates[cycle.placement].copies:
+            sender = hops.get((source, copy.get(source, "")))
+            if sender is not None and copy.get(hop.task) == hop.node:
+                return sender
+        # A guessed or repeated stamp has sent the cycle through other nodes, too.
+        return next((one for one in reversed([*hops.values()]) if one.task == source), None)
+
+    def _is_second(self, cycle: LiveCycle, task: str, node: str) -> bool:
+        """Whether a job belongs to the second copy of a cycle alone."""
+        placed = self._candidates[cycle.placement]
+        second = placed.second
+        return second is not None and second.get(task) == node != placed.first[task]
+
     def _split(self, cycle: LiveCycle, last: Completion) -> tuple[int, int, int] | None:
         """Split a latency into compute, queue and network along its critical path.
 
         The path runs backwards from the sink, to the input that arrived last at each job. Messages
         within a node count as queueing, and so do the ways to the first job and to the actuator.
         """
-        hops = {hop.task: hop for hop in last.hops}
-        hop = hops.pop(last.sink, None)
+        hops = _by_site(last.hops)
+        hop = hops.pop((last.sink, last.node), None)
         if hop is None:
             return None
         compute_ns = network_ns = 0
         while hop is not None:
             compute_ns += max(hop.ended_ns - hop.started_ns, 0)
             source, arrived_ns = max(hop.inputs, key=lambda given: given[1], default=("", 0))
-            sender = hops.pop(source, None)
+            sender = self._sender(cycle, hops, hop, source)
+            if sender is not None:
+                del hops[sender.task, sender.node]
             if sender is not None and sender.node != hop.node:
                 network_ns += self._since_origin(cycle, hop.node, arrived_ns)
                 network_ns -= self._since_origin(cycle, sender.node, sender.ended_ns)
@@ -507,7 +543,7 @@ class Ledger:
         """Resource names of the accelerators that a candidate's tasks run on."""
         known = self._accelerated.get(candidate)
         if known is None:
-            placed = self._candidates[candidate].first.items()
+            placed = self._candidates[candidate].sites
             executions = ((self._pipeline.tasks[task].on[node], node) for task, node in placed)
             names = (one.resource(node) for one, node in executions if one.accelerator is not None)
             known = self._accelerated[candidate] = frozenset(names)
@@ -594,6 +630,7 @@ class Ledger:
             ),
             "outcome": "done" if ended else "replaced",
             "shadow": shadow,
+            **({"second": self._is_second(cycle, *key[1:])} if self._copies > 1 else {}),
             **{name: ns if ended and ns != UNKNOWN else None for name, ns in counted_ns.items()},
         }
 
@@ -607,7 +644,8 @@ class Ledger:
         `shadows` tells whether the result has the shadows' instants.
         """
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
-        self._mark_not_due(known, cycles)
+        for tables in (known, of_shadows):
+            self._mark_not_due(tables, cycles)
         through = np.full(len(cycles), -1, np.int64)
         for row, cycle in enumerate(cycles):
             if cycle.shadow in self._codes:
@@ -620,21 +658,26 @@ class Ledger:
                     # Jobs that the shadow shares with the cycle, whose own report may be missing.
                     self._enter(known, row, cycle, ran, self._every - apart)
                     if len(ran) < len(report.hops):
-                        self._enter_arrivals(of_shadows, row, cycle, report.hops[-1])
+                        self._enter_arrivals(of_shadows, row, cycle, report.hops[-1], ())
             for report in (*cycle.replaced.values(), *cycle.reports.values()):
                 self._doubt(cycle, report)
                 self._enter(known, row, cycle, report.hops, self._every)
-            for report in cycle.samples.values():
+            for report in cycle.arrivals.values():
                 self._doubt(cycle, report)
-                self._enter(known, row, cycle, report.hops[:-1], self._every)
-                self._enter_arrivals(known, row, cycle, report.hops[-1])
+                self._enter(known, row, cycle, _ended(report), self._every)
+                if report.hops and report.hops[-1].ended_ns == UNKNOWN:
+                    self._enter_arrivals(known, row, cycle, report.hops[-1], report.hops)
             reported = cycle.deaf or cycle.reports or self.is_replaced(cycle) or cycle.told
             if cycle.heard and not (reported or cycle.idle):
-                self._mark_lost(known, row, cycle)
+                for copy in self._candidates[cycle.placement].copies:
+                    self._mark_lost(known, row, cycle, copy)
         for tables in (known, of_shadows):
             tables["work_ns"][tables["end_ns"] > close_ns] = UNKNOWN
             for name in ("ready_ns", "start_ns", "end_ns", "arrived_ns"):
                 tables[name][tables[name] > close_ns] = UNKNOWN
+        for row, cycle in enumerate(cycles):
+            if cycle.at_ns + cycle.latency_ns <= close_ns:
+                self._mark_cancelled(known, row, cycle)
         return Evidence.of(
             close_ns=close_ns,
             release_ns=release_ns,
@@ -648,12 +691,13 @@ class Ledger:
 
     def _unknown(self, cycles: int) -> dict[str, Ints]:
         """Return the fields of `Instants`, filled with `UNKNOWN`."""
-        columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), len(self._tasks))
-        columns["arrived_ns"] = len(self._flows)
+        of_tasks, of_flows = (self._copies * len(of) for of in (self._tasks, self._flows))
+        columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), of_tasks)
+        columns["arrived_ns"] = of_flows
         return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
 
     def _mark_not_due(self, known: Mapping[str, Ints], cycles: Sequence[LiveCycle]) -> None:
-        """Mark the jobs and messages of cycles in which they are not due."""
+        """Mark the jobs and messages of cycles, or shadows, in which they are not due."""
         if not self._pipeline.has_rates:
             return
         numbers = np.array([cycle.number for cycle in cycles], np.int64)
@@ -672,10 +716,12 @@ class Ledger:
         apart: frozenset[str],
     ) -> None:
         """Enter instants and work of jobs, and the instants of the messages that reached them."""
+        hops = tuple(hops)
         for hop in hops:
             column = self._tasks.get(hop.task)
             if column is None or hop.task not in apart:
                 continue
+            column += len(self._tasks) * self._is_second(cycle, hop.task, hop.node)
             ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
             if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
                 continue
@@ -687,14 +733,24 @@ class Ledger:
             # A shadow's last messages arrive at a sink whose job never runs.
             if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
                 known["ready_ns"][row, column] = max(ready_ns, 0)
-            self._enter_arrivals(known, row, cycle, hop)
+            self._enter_arrivals(known, row, cycle, hop, hops)
 
     def _enter_arrivals(
-        self, known: Mapping[str, Ints], row: int, cycle: LiveCycle, hop: Hop
+        self,
+        known: Mapping[str, Ints],
+        row: int,
+        cycle: LiveCycle,
+        hop: Hop,
+        hops: Sequence[Hop],
     ) -> None:
-        """Enter the instants of the messages that reached a job."""
+        """Enter the instants of the messages that reached a job; `hops` are the senders' jobs."""
         for source, arrived_ns in hop.inputs:
             flow = self._flows.get((source, hop.task))
+            if flow is not None and self._copies > 1:
+                sender = self._sender(cycle, _by_site(hops), hop, source)
+                ends = [one for one in (sender, hop) if one is not None]
+                is_second = any(self._is_second(cycle, one.task, one.node) for one in ends)
+                flow += len(self._flows) * is_second
             at_ns = self._since_origin(cycle, hop.node, arrived_ns)
             if flow is not None and cycle.shifts[hop.node].bound_ns < UNBOUNDED_NS:
                 known["arrived_ns"][row, flow] = max(at_ns, 0)
@@ -704,17 +760,49 @@ class Ledger:
         sampled = any((source, done.sink) in self._sampled for source in _arrived(done))
         return done.hops[:-1] if sampled else done.hops
 
-    def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
-        """Mark the first unconfirmed message between two nodes as lost."""
-        nodes = self._candidates[cycle.placement]
+    def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle, copy: Copy) -> None:
+        """Mark the first unconfirmed message of a copy between two nodes as lost."""
         for flow in self._forward:
-            column = self._flows[flow.source, flow.target]
-            is_lost = known["arrived_ns"][row, column] == UNKNOWN
-            if nodes[flow.source] != nodes[flow.target] and is_lost and self._loses(flow, cycle):
-                source = self._tasks[flow.source]
+            column = self._flow_column(cycle, flow, copy)
+            is_lost = known["arrived_ns"][row, column] < 0
+            if copy[flow.source] != copy[flow.target] and is_lost and self._loses(flow, cycle):
+                source, node = self._tasks[flow.source], copy[flow.source]
+                source += len(self._tasks) * self._is_second(cycle, flow.source, node)
+                known["arrived_ns"][row, column] = UNKNOWN
                 if known["end_ns"][row, source] < 0:
                     known["end_ns"][row, source] = cycle.at_ns
                 return
+
+    def _flow_column(self, cycle: LiveCycle, flow: Flow, copy: Copy) -> int:
+        """Return the column of a flow in a copy of a cycle."""
+        ends = ((task, copy[task]) for task in (flow.source, flow.target))
+        is_second = any(self._is_second(cycle, *end) for end in ends)
+        return self._flows[flow.source, flow.target] + len(self._flows) * is_second
+
+    def _mark_cancelled(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
+        """Mark what the slower copy of a cycle that is done has not done: it shows no loss.
+
+        A copy without any report is lost, unless the cycle was done before its hold ended.
+        """
+        placed = self._candidates[cycle.placement]
+        if not isinstance(placed, Replicas):
+            return
+        arrived = known["arrived_ns"][row]
+        arrived[arrived == UNKNOWN] = NOT_DUE
+        # A job that is ready has been replaced, and its copy lost.
+        unknown = (known["end_ns"][row] == UNKNOWN) & (known["ready_ns"][row] == UNKNOWN)
+        for name in ("ready_ns", "start_ns", "end_ns", "work_ns"):
+            known[name][row][unknown] = NOT_DUE
+        held_ns = 0, round(placed.after_ms * 1e6)
+        for copy, after_ns in zip(placed.copies, held_ns, strict=True):
+            flows = (flow for flow in self._forward if not self._is_shared(placed, flow))
+            columns = [self._flow_column(cycle, flow, copy) for flow in flows]
+            if cycle.latency_ns > after_ns and (arrived[columns] < 0).all() and not cycle.deaf:
+                self._mark_lost(known, row, cycle, copy)
+
+    def _is_shared(self, placed: Replicas, flow: Flow) -> bool:
+        """Whether both copies share a flow's message."""
+        return {flow.source, flow.target}.isdisjoint(placed.doubled)
 
     def _loses(self, flow: Flow, cycle: LiveCycle) -> bool:
         """Whether the loss of a flow's message loses a cycle."""
@@ -727,7 +815,7 @@ class Ledger:
         images. A task whose inputs were replaced sends nothing. `through` is the cycle's placement,
         or the candidate of its shadow.
         """
-        nodes = self._candidates[through]
+        nodes = self._candidates[through].first
         hops = [*cycle.hops, *(hop for done in cycle.shadows for hop in done.hops)]
         there = {
             (source, hop.task)
@@ -756,8 +844,8 @@ class Ledger:
         """Tasks that a cycle does not share with its shadow."""
         pair = cycle.placement, cycle.shadow
         if pair not in self._apart:
-            here, there = (self._candidates[name].first for name in pair)
-            self._apart[pair] = self._pipeline.diverging(here, there)
+            here, there = (self._candidates[name] for name in pair)
+            self._apart[pair] = self._pipeline.diverging(here, there.first)
         return self._apart[pair]
 
     def shadow_ends(self, cycle: LiveCycle) -> frozenset[str]:
@@ -776,7 +864,7 @@ class Ledger:
             if cycle.shadow not in self._codes:
                 continue
             sent += 1
-            apart, there = self._diverging(cycle), self._candidates[cycle.shadow]
+            apart, there = self._diverging(cycle), self._candidates[cycle.shadow].first
             hops = [hop for report in cycle.shadows for hop in report.hops]
             ended = {hop.task for hop in hops if hop.ended_ns != UNKNOWN}
             total += sum(
@@ -793,6 +881,17 @@ def _between(before_ns: int, after_ns: int) -> int:
     """Difference of two counts; `UNKNOWN` if one is unknown or the counter has restarted."""
     known = UNKNOWN not in (before_ns, after_ns) and after_ns >= before_ns
     return after_ns - before_ns if known else UNKNOWN
+
+
+def _by_site(hops: Iterable[Hop]) -> dict[Site, Hop]:
+    """Return jobs by task and node."""
+    return {(hop.task, hop.node): hop for hop in hops}
+
+
+def _ended(done: Completion) -> Sequence[Hop]:
+    """Return the jobs of a report of `WITHOUT_JOB` that have ended."""
+    is_arrival = done.hops and done.hops[-1].ended_ns == UNKNOWN
+    return done.hops[:-1] if is_arrival else done.hops
 
 
 def _arrived(done: Completion) -> Iterator[str]:

@@ -180,7 +180,7 @@ def _symptoms(
             yield f"{role.who} has applied nothing since {_time(age_ms)}{_because(why)}"
     recent = status["recent"]
     rates = recent["violation_rates"]
-    placed = problem.candidates[status["placement"]].items()
+    placed = problem.candidates[status["placement"]].sites
     names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
     unreached = [] if slow else _unreached(problem, status, recent["unreached"])
     why = [*slow, *unreached, *_notes(status, names)]
@@ -189,8 +189,8 @@ def _symptoms(
         rate = RATE.text(sum(rates) / len(rates))
         yield f"{RATE.name} is {rate} in the last {counted(len(rates), 'window')}{_because(why)}"
     for name, found in status["failing"].items():
-        placed = problem.candidates[name].items()
-        if not {node for _, node in placed}.isdisjoint(status["drained"]):
+        placed = problem.candidates[name].sites
+        if not problem.candidates[name].nodes.isdisjoint(status["drained"]):
             continue
         why = [
             *_unreached(problem, status, found["unreached"]),

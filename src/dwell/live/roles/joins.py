@@ -61,8 +61,8 @@ class Joins:
     open_cycles: int = 1
     waiting: dict[tuple[int, int], Inputs] = field(default_factory=dict)
     newest: tuple[int, int] = (-1, -1)
-    # Complete cycles among the newest `open_cycles`.
-    done: set[tuple[int, int]] = field(default_factory=set)
+    # Nodes that the inputs of complete cycles came from, among the newest `open_cycles`.
+    done: dict[tuple[int, int], dict[str, str]] = field(default_factory=dict)
 
     @property
     def _last_over(self) -> tuple[int, int]:
@@ -86,10 +86,22 @@ class Joins:
         self.newest = max(self.newest, cycle)
         del self.waiting[cycle]
         last = self._last_over
-        self.done = {other for other in (*self.done, cycle) if other > last}
+        self.done[cycle] = {source: one.node for source, (one, _, _) in inputs.items()}
+        self.done = {other: nodes for other, nodes in self.done.items() if other > last}
         for other in [other for other in self.waiting if other <= last]:
             self._evict(other)
         return inputs
+
+    def is_late(self, header: Header) -> bool:
+        """Whether the other copy's message of this flow came first, or the cycle is too old."""
+        cycle = header.stamp.key
+        waiting = self.waiting.get(cycle, {}).get(header.source)
+        nodes = self.done.get(cycle, {}) if waiting is None else {header.source: waiting[0].node}
+        return cycle <= self._last_over or nodes.get(header.source, header.node) != header.node
+
+    def cancel(self, cycle: tuple[int, int]) -> Inputs:
+        """Return the inputs that wait in a cycle, and forget them."""
+        return self.waiting.pop(cycle, {})
 
     def _evict(self, cycle: tuple[int, int]) -> None:
         self.drop(header for header, _, _ in self.waiting.pop(cycle).values())

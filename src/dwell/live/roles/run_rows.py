@@ -136,6 +136,8 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
         features.append("shadows")
     if controller.problem.objective.latency is not None:
         features.append("chain")
+    if controller.problem.replicas:
+        features.append("replicas")
     tables = ["cycles", "windows", "decisions", *(("jobs", "processes") if jobs else ())]
     return {name: column_types(name, controller.problem, features) for name in tables}
 
@@ -317,6 +319,8 @@ class RunRows:
             "unproven": window.unproven,
             "closed_unix_ns": window.closed_unix_ns,
         }
+        if self._controller.problem.replicas:
+            values["late_copies"] = sum(cycle.late_copies for cycle in cycles)
         if self._sends_shadows:
             sent, sent_bytes = self._ledger.shadow_bytes(cycles)
             values |= {"shadow_cycles": sent, "shadow_bytes": sent_bytes}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from dwell.live.roles.joins import MAX_JOINS, Job
 from dwell.live.roles.offsets import Offsets
 from dwell.live.roles.role import RolePlace
@@ -15,9 +17,12 @@ class SourceCycles:
 
     If the source's node is not the stamper's, stamps arrive one cycle early. If a stamp is missing
     and cycles are released by a timer, the source guesses stamps for up to g cycles, at least one.
+    `offset_ns` returns the time from the release of a cycle to its begin here.
     """
 
-    def __init__(self, place: RolePlace, offsets: Offsets, offset_ns: int, rate: int) -> None:
+    def __init__(
+        self, place: RolePlace, offsets: Offsets, rate: int, offset_ns: Callable[[Stamp], int]
+    ) -> None:
         self._place, self._offsets, self._offset_ns = place, offsets, offset_ns
         self._rate = rate
         self._guesses = max(place.problem.controller.guard_cycles // rate, 1)
@@ -37,6 +42,11 @@ class SourceCycles:
             if len(self._waiting) > MAX_JOINS:
                 del self._waiting[min(self._waiting)]
 
+    def cancel(self, cycle: tuple[int, int]) -> None:
+        """Forget the stamp of a cycle that is done."""
+        header, _ = self._waiting.pop(cycle, (None, 0))
+        self._last = header or self._last
+
     def _begins_ns(self, header: Header) -> int:
         return self._offsets.from_reference(self._place.node, header.stamp.released_ns)[0]
 
@@ -45,12 +55,12 @@ class SourceCycles:
         """Instant at which the next cycle begins, or its stamp is guessed."""
         if self._waiting:
             header, _ = self._waiting[min(self._waiting)]
-            return self._begins_ns(header) + self._offset_ns
+            return self._begins_ns(header) + self._offset_ns(header.stamp)
         if self._last is None or not self._alone or self._guessed >= self._guesses:
             return NEVER_NS
         period_ns = self._place.period_ns
         begins_ns = self._begins_ns(self._last) + self._rate * period_ns
-        return begins_ns + self._offset_ns + period_ns // 4
+        return begins_ns + self._offset_ns(self._last.stamp) + period_ns // 4
 
     def due(self, now_ns: int) -> Job | None:
         """Return the job of the cycle that begins now; None if no cycle does."""

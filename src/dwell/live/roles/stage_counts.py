@@ -230,7 +230,7 @@ class StageTable:
 
     def slow(self, placement: Placement, newest: Key) -> Iterator[dict[str, Any]]:
         """Yield the stages of a placement whose median job takes longer than from job to job."""
-        for task, node in placement.items():
+        for task, node in placement.sites:
             name = f"{task}@{node}"
             one = next(self._recent(name, newest), None)
             if one is not None and one.median_ns > self._rates[task] * self._period_ns:

@@ -35,6 +35,7 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
 from dwell.model.instants import NEVER_NS
+from dwell.model.shadow_plan import alternatives
 
 #: Time without orders after which another controller may take over.
 LEASE_NS = 1_000_000_000
@@ -111,9 +112,10 @@ class Stamper:
         # A continued run releases cycles at once; a new run waits for the workers of its placement.
         self._begun, self._since_ns = entry.reserved > 0, now_ns
         # Sources on other nodes get their stamps one cycle early.
-        self._early = any(node != place.node for _, node, _ in self._sources())
+        self._early = any(one.node != place.node for one in self._sources())
         self._ahead: Stamp | None = None
         self._names = tuple(problem.candidates)
+        self._alternatives = alternatives(problem.candidates)
         self._due = self.routes.due
         self.intervals = Intervals(place.node, self._due.sinks)
         # Tasks that have reported cycles, and shadows, of which others have not.
@@ -451,11 +453,11 @@ class Stamper:
     def _workers(self) -> Iterator[str]:
         """Yield the names of the workers of the current placement."""
         placed = self.place.problem.candidates[self.placement]
-        return (f"{task}@{node}" for task, node in placed.items())
+        return (f"{task}@{node}" for task, node in placed.sites)
 
     def _gates(self) -> Iterator[str]:
         """Yield the names of the sinks' processes of the current placement."""
-        placed = self.place.problem.candidates[self.placement]
+        placed = self.place.problem.candidates[self.placement].first
         return (f"sink.{task}@{placed[task]}" for task in self.place.problem.pipeline.sinks)
 
     def _release(self, released_ns: int, now_ns: int) -> None:
@@ -488,12 +490,12 @@ class Stamper:
         """Send a stamp to the sources on this node, on other nodes, or both."""
         place = self.place
         header = encode(Header(stamp, STAMPER, place.node, "none", seal=place.stamped(stamp)))
-        for task, node, kind in self.routes.destinations(STAMPER, stamp):
+        for task, node, kind, _ in self.routes.destinations(STAMPER, stamp):
             if here if node == place.node else elsewhere:
                 place.transport.put(place.keys.of(channels.INPUT, task, node, kind), b"", header)
 
     def _stamp(self, cycle: int, released_ns: int) -> Stamp:
-        wanted = self.guard.probation.wanted if self.course.by_guard else None
+        wanted = self.guard.probed if self.course.by_guard else None
         shadow = wanted or self._shadowed(cycle)
         if shadow == self.placement:
             shadow = ""
@@ -503,8 +505,8 @@ class Stamper:
         """Return the candidate of this cycle's shadow by the estimator's plan; empty if none."""
         if not self.shadow_fraction:
             return ""
-        code = self._names.index(self.placement)
-        plan = shadow_stamps(cycle, cycle + 1, code, len(self._names), self.shadow_fraction)
+        others = self._alternatives[self._names.index(self.placement)]
+        plan = shadow_stamps(cycle, cycle + 1, others, self.shadow_fraction)
         return self._names[int(plan[0])] if plan[0] >= 0 else ""
 
     # --------------------------------------------------------------------------- beats

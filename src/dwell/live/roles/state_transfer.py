@@ -16,6 +16,7 @@ from dwell.live.wire.messages import Restored, Snapshot, State, decode, encode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import SPARE, lane_of, longest_bytes
 from dwell.model.instants import NEVER_NS
+from dwell.model.placement import nodes_of
 
 #: Least time between two checkpoints, as a multiple of the cost of a checkpoint.
 CHECKPOINT_SPACING = 20
@@ -60,8 +61,8 @@ class StateTransfer:
         self._rate = place.problem.pipeline.rates[task]
         self._state_bytes, self._nodes = declared.state_bytes, frozenset(declared.on)
         self.stateful = stage.stateful and not shadow
-        #: Request for the state here, and request for a state to be sent here.
-        self.asked: Snapshot | None = None
+        #: Requests for the state here by new node, and request for a state to be sent here.
+        self.asked: dict[str, Snapshot] = {}
         self.awaited: Snapshot | None = None
         # Received states and checkpoints by sending node.
         self._answers: dict[str, tuple[State, bytes]] = {}
@@ -113,9 +114,10 @@ class StateTransfer:
 
     def next_chore(self) -> Chore | None:
         """Return the chore before the next job; `call` and `finish` must follow."""
-        asked = self.asked
+        asked = next(iter(self.asked.values()), None)
         if asked is not None and self.at >= self._last_before(asked):
-            self.asked, chore = None, Chore((asked.to,), asked.number)
+            del self.asked[asked.to]
+            chore = Chore((asked.to,), asked.number)
         elif (found := self._restoring) is not None:
             self.awaited = None
             self._answers.clear()
@@ -132,7 +134,7 @@ class StateTransfer:
         if "/snapshot/" in sample.key:
             asked = self.place.read(channels.SNAPSHOT, sample)
             if asked.task == self.task and asked.node == self.place.node:
-                self.asked = asked
+                self.asked[asked.to] = asked
             elif asked.task == self.task and asked.to == self.place.node:
                 self.awaited = asked
             return
@@ -261,9 +263,12 @@ class StateTransfer:
 
     def plan_checkpoint(self, job: Job, now_ns: int) -> None:
         """Plan a checkpoint every `checkpoint_cycles` jobs, for at most 1/20 of the time."""
-        nodes = self._checkpoint_nodes
-        number = job.header.stamp.cycle // self._rate
-        if not nodes or number % self.place.problem.live.checkpoint_cycles:
+        problem, stamp = self.place.problem, job.header.stamp
+        # A node that runs the task in this cycle needs no checkpoint.
+        running = nodes_of(problem.candidates[stamp.placement][self.task])
+        nodes = tuple(node for node in self._checkpoint_nodes if node not in running)
+        number = stamp.cycle // self._rate
+        if not nodes or number % problem.live.checkpoint_cycles:
             return
         rests = 0 <= now_ns - self._snapshot_ns < CHECKPOINT_SPACING * self._cost_ns
         if not (rests or self._too_slow):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import partial
 
 from msgspec.structs import asdict
 
@@ -12,6 +13,7 @@ from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN, Counts
 from dwell.live.roles.joins import MAX_JOINS, Job, Joins
 from dwell.live.roles.origins import joint_origins, origins_of
+from dwell.live.roles.replicated_cycles import ReplicatedCycles
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.roles.sampled_inputs import SampledInputs
 from dwell.live.roles.source_cycles import SourceCycles
@@ -21,6 +23,8 @@ from dwell.live.stage import CellStage, Message
 from dwell.live.wire import channels
 from dwell.live.wire.keys import MAIN, SHADOW
 from dwell.live.wire.messages import (
+    CANCELLED,
+    LATE,
     SAMPLED,
     Completion,
     Header,
@@ -28,14 +32,15 @@ from dwell.live.wire.messages import (
     Origin,
     RatedHop,
     Rates,
+    Stamp,
     encode,
 )
 from dwell.live.wire.payloads import read_payload, write_payload
-from dwell.live.wire.routing import STAMPER, Routes
+from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import lane_of, longest_bytes
 from dwell.model import FrozenDict
-from dwell.model.instants import EVIDENCE_NS
+from dwell.model.instants import EVIDENCE_NS, NEVER_NS
 
 #: Periods between two beats of a shadow worker.
 SHADOW_BEAT = 10
@@ -106,9 +111,15 @@ class Worker:
         self._jobs: deque[Job] = deque()
         offset_ns = round(problem.pipeline.tasks[task].offset_ms * 1e6)
         rate = self.routes.due.rates[task]
+
+        def begins_ns(stamp: Stamp) -> int:
+            return max(offset_ns, self.routes.begins_ns(task, place.node, stamp))
+
         self._source = (
-            SourceCycles(place, self.offsets, offset_ns, rate) if STAMPER in sources else None
+            SourceCycles(place, self.offsets, rate, begins_ns) if STAMPER in sources else None
         )
+        #: Cycles with two copies.
+        self.copies = ReplicatedCycles(problem)
         # Whether chains and samples count the age of data from its cycles.
         chains = problem.pipeline.chains.values()
         firsts = {*self.routes.due.sources, *(chain.source for chain in chains)}
@@ -154,6 +165,8 @@ class Worker:
         yield keys.of(channels.INPUT, self.task, node, MAIN)
         if self.is_sink or self.samples.sources:
             yield keys.of(channels.INPUT, self.task, node, SHADOW)
+        if self.place.problem.replicas:
+            yield keys.all(channels.DONE)
         yield from self.transfer.subscriptions()
         yield from self.samples.subscriptions()
 
@@ -172,6 +185,10 @@ class Worker:
                     self.transfer.receive(sample)
                 case channels.STAMPED | channels.VALUE:
                     self.samples.receive(sample, now_ns)
+                case channels.DONE:
+                    done = self.place.completion(sample)
+                    if self.copies.completed(done):
+                        self._cancel(done.stamp.key)
         except LiveError as error:
             self.place.complain(error)
 
@@ -182,7 +199,8 @@ class Worker:
         if header.stamp.term:  # not a source's guess
             self.transfer.stamped(header.stamp.key)
         if header.source == STAMPER and self._source is not None:
-            self._source.stamped(header, now_ns)
+            if not self.copies.is_done(header.stamp):
+                self._source.stamped(header, now_ns)
             return
         sampled = header.source in self.samples.sources
         # The shadow worker takes what its jobs wait for; this worker reports the rest.
@@ -199,6 +217,10 @@ class Worker:
             return
         if sampled:
             self._sample(header, sample.payload, kind, now_ns)
+            return
+        if kind == MAIN and self._is_late(header):
+            self.book.ended([header], DROPPED)
+            self._report(header, now_ns, LATE)
             return
         complete = self._joins[kind].add(header, sample.payload, now_ns)
         if complete is None:
@@ -226,14 +248,34 @@ class Worker:
             outcome = SAMPLED
             is_newest = self.samples.take(header, payload, now_ns)
             self.book.ended([header], TAKEN if is_newest else DROPPED)
-        stamp, place = header.stamp, self.place
-        is_here = kind == SHADOW or self.routes.runs(self.task, place.node, stamp)
-        if is_here and not self.stands_by:
-            times = now_ns, UNKNOWN, UNKNOWN
-            here = Hop(self.task, place.node, *times, ((header.source, now_ns),))
-            hops = (*header.hops, here)
-            ended = Completion(stamp, self.task, now_ns, outcome, hops, place.node)
-            place.send(channels.ENDED, ended)
+        if kind == SHADOW or self.routes.runs(self.task, self.place.node, header.stamp):
+            self._report(header, now_ns, outcome)
+
+    def _report(self, header: Header, now_ns: int, outcome: str) -> None:
+        """Report the arrival of a message that begins no job, with all jobs upstream of it."""
+        if not self.stands_by:
+            self._end(Job(header, {header.source: (header, b"", now_ns)}, False), outcome)
+
+    def _is_late(self, header: Header) -> bool:
+        """Whether a message is late: its cycle is done, or the other copy's message came first."""
+        stamp, copies = header.stamp, self.copies
+        return copies.has_copies(stamp) and (
+            copies.is_done(stamp) or self._joins[MAIN].is_late(header)
+        )
+
+    def _cancel(self, cycle: tuple[int, int]) -> None:
+        """Drop what waits in a cycle with two copies that is done."""
+        jobs = [job for job in self._jobs if job.order == cycle and not job.shadow]
+        for job in jobs:
+            self._jobs.remove(job)
+        waiting = self._joins[MAIN].cancel(cycle)
+        jobs += [Job(header, waiting, False) for header, _, _ in [*waiting.values()][:1]]
+        for job in jobs:
+            self.book.ended(job.headers, DROPPED)
+            if not self.stands_by:
+                self._end(job, CANCELLED)
+        if self._source is not None:
+            self._source.cancel(cycle)
 
     def _replace(self, job: Job) -> None:
         """Report a job that a later cycle has replaced."""
@@ -306,19 +348,20 @@ class Worker:
         """Seconds after which a job may be due without a message."""
         # A standby must notice silence.
         rest_s = 0.01 if self.stands_by else 0.2
-        if self._source is None:
-            return rest_s
-        return min(max((self._source.due_ns - now_ns) / 1e9, 0.0), rest_s)
+        due_ns = self.copies.due_ns if self._source is None else self._source.due_ns
+        return min(max((min(due_ns, self.copies.due_ns) - now_ns) / 1e9, 0.0), rest_s)
 
     @property
     def has_work(self) -> bool:
         """Whether `next_chore` or `next_job` may return something."""
-        waits = self._jobs or self._source is not None or self.transfer.pending
+        holds = self.copies.due_ns < NEVER_NS
+        waits = self._jobs or self._source is not None or self.transfer.pending or holds
         return bool(waits) and self.busy_since_ns is None
 
     def next_job(self, now_ns: int) -> Job | None:
         """Return the job to run now, or None; `run` and `finish` must follow."""
         self._now_ns = now_ns
+        self.copies.send_due(now_ns)
         if self.busy_since_ns is not None or not self.started:
             return None
         if self._source is not None and (job := self._source.due(now_ns)) is not None:
@@ -415,7 +458,8 @@ class Worker:
             return
         try:
             kind, data = write_payload(output.payload)
-            destinations = self.routes.destinations(self.task, stamp, shadow=job.shadow)
+            routes, node = self.routes, place.node
+            destinations = routes.destinations(self.task, stamp, node, shadow=job.shadow)
         except LiveError as error:
             self._failed(f"cycle {stamp.cycle}: {error}")
             return
@@ -440,18 +484,38 @@ class Worker:
             elif runs_here or not self.transfer.stateful:
                 place.transport.put(place.keys.of(channels.COMMAND, self.task), data, head)
         elif job.shadow or runs_here:
-            for target, node, to in destinations:
-                declared = self._output_bytes[target]
-                longest = longest_bytes(declared)
-                if len(data) > longest:
-                    reason = too_long(f"its output of {len(data)}", longest, "the flow's bytes")
-                    self._failed(f"cycle {stamp.cycle}: {reason}")
-                    continue
-                key = place.keys.of(channels.INPUT, target, node, to)
-                place.transport.put(key, data, head, lane=lane_of(declared))
-                if to == MAIN:
-                    self.book.sent(stamp, f"{target}@{node}", len(data))
+            if not job.shadow and self.copies.is_done(stamp):
+                ended = Completion(stamp, self.task, ended_ns, CANCELLED, hops, place.node)
+                place.send(channels.ENDED, ended)
+                destinations = ()
+            for target in destinations:
+                self._send(target, stamp, data, head, ended_ns)
             self.transfer.plan_checkpoint(job, ended_ns)
+
+    def _send(
+        self, to: Destination, stamp: Stamp, data: bytes | memoryview, head: bytes, now_ns: int
+    ) -> None:
+        """Send an output to a worker, now or when its hold ends."""
+        declared, place = self._output_bytes[to.task], self.place
+        longest = longest_bytes(declared)
+        if len(data) > longest:
+            reason = too_long(f"its output of {len(data)}", longest, "the flow's bytes")
+            self._failed(f"cycle {stamp.cycle}: {reason}")
+            return
+
+        def put(payload: bytes | memoryview) -> None:
+            key = place.keys.of(channels.INPUT, to.task, to.node, to.kind)
+            place.transport.put(key, payload, head, lane=lane_of(declared))
+            if to.kind == MAIN:
+                self.book.sent(stamp, f"{to.task}@{to.node}", len(payload))
+
+        released_ns, _ = self.offsets.from_reference(place.node, stamp.released_ns)
+        due_ns = released_ns + to.after_ns
+        if to.after_ns and due_ns > now_ns:
+            # The stage may use its memory again.
+            self.copies.hold(stamp, due_ns, partial(put, bytes(data)))
+        else:
+            put(data)
 
     def _origins(self, job: Job) -> tuple[Origin, ...]:
         """Return the cycles from which a job descends."""
@@ -517,6 +581,7 @@ class Worker:
         return BeatState(moving=moving, rates=None if topic is None else Rates(*topic))
 
     def wake(self, now_ns: int) -> int:
-        """Send the beat if it is due; return the instant of the next one."""
+        """Send the beat and the held messages that are due; return when to call again."""
         self._now_ns = max(self._now_ns, now_ns)
-        return self.pulse.wake(now_ns)
+        self.copies.send_due(now_ns)
+        return min(self.pulse.wake(now_ns), self.copies.due_ns)

@@ -63,7 +63,7 @@ def _nodes(problem: Problem, status: Mapping[str, Any]) -> Iterator[dict[str, An
 
 def _stages(problem: Problem, status: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     placement = problem.candidates.get(status["placement"] or "")
-    for task, node in placement.first.items() if placement is not None else ():
+    for task, node in placement.sites if placement is not None else ():
         who = f"{task}@{node}"
         process = status["processes"].get(who) or {"ready": False, "note": "never heard"}
         counts = status["stages"].get(who) or {}

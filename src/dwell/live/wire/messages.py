@@ -23,6 +23,9 @@ ACTUATED, NOT_APPLIED = HANDED_OVER = "actuated", "not_applied"
 STALE = "stale"
 #: Outcome of a job whose output a task has sampled: the output has arrived there.
 SAMPLED = "sampled"
+#: Outcomes in a cycle with two copies: of a message that arrives after the other copy's, or after
+#: the cycle is done, and of a job that does not run, or sends nothing, because the cycle is done.
+LATE, CANCELLED = "late", "cancelled"
 #: Outcome of a command that the gate stops, because it has passed a later cycle's command.
 BEHIND = "behind"
 #: Start of the refusal of an order while another controller is in charge.
@@ -210,7 +213,7 @@ class Completion(_Array, frozen=True):
         ``actuated``, ``not_applied`` (the actuator raised), ``behind`` (a later cycle had been
         actuated), ``stale`` (older than `max_age_ms`); ``shadow`` at the end of a shadow;
         ``replaced`` if a later cycle replaced the job; ``sampled`` if its output has arrived at a
-        task that does not wait for it.
+        task that does not wait for it; ``late`` and ``cancelled`` of the slower copy.
     node : str
         Node of the sink or of the job.
     group_ns : int

@@ -7,7 +7,7 @@ result.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from typing import Literal, TypeAlias
@@ -17,6 +17,7 @@ from dwell.live.wire.local_addresses import running_elsewhere
 from dwell.live.wire.messages import MAX_CONTROL_BYTES, MAX_HEADER_BYTES
 from dwell.live.wire.transport import Lane
 from dwell.model import FrozenDict, Problem
+from dwell.model.placement import nodes_of
 
 Kind: TypeAlias = Literal[
     "stamper", "sink", "agent", "worker", "shadow", "standby", "controller", "visitor"
@@ -190,7 +191,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
     _require_no_prices(problem)
-    _require_no_replicas(problem)
+    _require_states_in_step(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
     hosts = problem.live.hosts
@@ -282,9 +283,10 @@ def _shadows(problem: Problem) -> frozenset[tuple[str, str]]:
         return frozenset()
     pipeline = problem.pipeline
     return frozenset(
-        (task, other[task])
-        for active, other in permutations([one.first for one in problem.candidates.values()], 2)
-        for task in pipeline.diverging(active, other)
+        (task, other.first[task])
+        for active, other in permutations(problem.candidates.values(), 2)
+        if other.second is None
+        for task in pipeline.diverging(active, other.first)
         if pipeline.outputs(task)
     )
 
@@ -324,8 +326,10 @@ def _calls(problem: Problem, one: Role, other: Role) -> bool:
             return True
         case "agent":  # supervises its own node; the relay's agent forwards for all others
             return other.kind == "agent" or same_node or one.node == problem.relay_node
-        case "sink":  # receives the commands of its task's workers
-            return other.kind == "controller" or (other.works and other.task == one.task)
+        case "sink":  # receives its task's commands; reports ends of cycles with two copies
+            copied = bool(problem.replicas) and other.kind != "shadow"
+            is_served = other.works and (copied or other.task == one.task)
+            return other.kind == "controller" or is_served
         case "standby":  # works only while its worker is silent
             return other.kind == "worker" and same_node and other.task == one.task
         case "controller":  # receives completions, loads, ended shadows, samples, states
@@ -355,16 +359,24 @@ def _require_no_prices(problem: Problem) -> None:
         )
 
 
-def _require_no_replicas(problem: Problem) -> None:
-    """Raise a LiveError if a candidate has replicas."""
-    if problem.replicas:
-        raise LiveError(
-            "\n".join(
-                f"candidates.{name}.replicas: not supported in the live cell {problem.name}: live "
-                "has no replicas yet; remove the candidate, or use dwell run"
-                for name in problem.replicas
-            )
-        )
+def lagging_states(problem: Problem) -> Iterator[Fault]:
+    """Yield the second copies that start later and have states of their own."""
+    tasks = problem.pipeline.tasks
+    for name, one in problem.replicas.items():
+        for task in one.doubled if one.after_ms > 0 else ():
+            if tasks[task].state_bytes:
+                yield Fault(
+                    f"candidates.{name}.after_ms",
+                    f"{one.after_ms:g} is not supported in live cells: {task} has a state on "
+                    f"{' and '.join(nodes_of(one[task]))}, and the second one misses the cycles "
+                    "that are done before; set it to 0",
+                )
+
+
+def _require_states_in_step(problem: Problem) -> None:
+    """Raise a LiveError with `lagging_states`."""
+    if faults := [*lagging_states(problem)]:
+        raise LiveError("\n".join(map(str, faults)))
 
 
 def _require_hosts(problem: Problem, everybody: Sequence[Role]) -> None:
