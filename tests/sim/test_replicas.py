@@ -16,7 +16,7 @@ from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Site
 from dwell.estimators.profile import Profile
 from dwell.estimators.scaling import Scaling
-from dwell.model import Problem, QoS
+from dwell.model import NodeDisturbance, Problem, QoS
 from tests.reference.test_against import Probe
 
 CELL: dict[str, Any] = {
@@ -178,8 +178,9 @@ def test_the_guard_leaves_replicas_of_which_neither_copy_completes_cycles() -> N
 @pytest.mark.parametrize(("down", "returns"), [("A", False), ("B", True)])
 def test_probes_of_replicas_go_through_their_first_member(down: str, returns: bool) -> None:
     problem = failing("A", "B")
-    (one,) = (item for item in problem.scenario("fails") if down != item.node)
-    others = [item for item in problem.scenario("fails") if down == item.node]
+    items = [one for one in problem.scenario("fails") if isinstance(one, NodeDisturbance)]
+    (one,) = (item for item in items if down != item.node)
+    others = [item for item in items if down == item.node]
     problem = replace(problem, scenarios={"fails": (replace(one, for_s=10.0), *others)})
     run = guarded(problem, "NOW")
     assert (run.cycles["placement"][-1] == "NOW") == returns
