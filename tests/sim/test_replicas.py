@@ -15,6 +15,7 @@ from dwell.errors import ProblemError
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Site
 from dwell.estimators.profile import Profile
+from dwell.estimators.scaling import Scaling
 from dwell.model import Problem, QoS
 from tests.reference.test_against import Probe
 
@@ -106,6 +107,19 @@ def test_a_cancelled_copy_is_not_lost(cell: Problem) -> None:
     assert len(times[Site("work", "B")]) < 5
     assert all(np.isfinite(values).all() for values in times.values())
     assert (seen.cycles.ready_ns[:, 4] == -2).sum() > 45
+
+
+@pytest.mark.parametrize("estimator", ["corrected", "scaling"])
+def test_estimators_learn_from_a_slow_copy(estimator: str) -> None:
+    scenarios = {"slow": [{"node": "A", "at_s": 10, "stress_threads": 999}]}
+    controller = {"on": "R", "decide_cycles": 50}
+    cell = from_document({**CELL, "scenarios": scenarios, "controller": controller})
+    given = Scaling(cell, {("work", "A", "B"): 0.5}) if estimator == "scaling" else estimator
+    run = dwell.simulate(cell, scenario="slow", policy="NOW", estimator=given, seed=1, windows=6)
+    last = run.decisions.row(-1, named=True)
+    assert last["est_violation_rate_ONE"] > 0.9
+    assert last["est_violation_rate_NOW"] < 0.1
+    assert last["est_violation_rate_TWO"] < 0.1
 
 
 def failing(**for_s: float) -> Problem:
