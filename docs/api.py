@@ -22,7 +22,7 @@ NAMES: Mapping[str, Mapping[str, str]] = {
     "Extend": {
         "dwell.model": "Problem Placement QoS Objective Weights Targets Caps",
         "dwell.cost": "cost hamming",
-        "dwell.policies": "check_policy DTP ATP Cusum LatencyFirst WorkFunction Static",
+        "dwell.policies": "check_policy DTP ATP Cusum LatencyFirst WorkFunction Replicate Static",
         "dwell.estimators": "Profile Shadow Scaling Corrected",
         "dwell.live.stage": "Message Stage Actuator",
     },

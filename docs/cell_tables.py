@@ -45,6 +45,7 @@ SHAPES = {
     "caps": cell_form.CAPS,
     "misses": cell_form.MISSES,
     "the controller": cell_form.CONTROLLER,
+    "replicate": cell_form.REPLICATE,
     "the servo": cell_form.SERVO,
     "its target": cell_form.TARGET,
     "a ROS 2 topic": cell_form.ROS_TOPIC,

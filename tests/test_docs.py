@@ -11,11 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import pytest
 import typer.main
 from typer.testing import CliRunner
 
-from docs import api, gallery, messages, site
+from docs import api, gallery, messages, replicas, site
 from docs import commands as commands_page
 from docs import metrics as metrics_page
 from dwell.cli.commands import app
@@ -195,3 +196,10 @@ def test_pictures_of_the_gallery_have_their_data(picture: gallery.Picture) -> No
     page = (ROOT / "docs" / "start" / "gallery.md").read_text(encoding="utf-8")
     assert f"images/{picture.name}.svg" in page
     assert (gallery.IMAGES / f"{picture.name}.csv").is_file()
+
+
+def test_the_figure_of_replicas_has_the_shares_that_a_short_run_has() -> None:
+    kept, found = pl.read_csv(replicas.DATA), replicas.rows(windows=10, seeds=2)
+    by = ["scenario", "policy", "at"]
+    assert kept.select(by).equals(found.select(by))
+    assert found["mean"].to_list() == pytest.approx(kept["mean"].to_list(), abs=1.0)

@@ -105,7 +105,8 @@ estimator: corected
         "fleet.yaml:7: cells[3].weight: unknown key 'weight'; known: count, scenario, policy, "
         "estimator, phase_ms, cell",
         "fleet.yaml:7: cells[3].policy: unknown policy 'dpt'; did you mean 'dtp'? (policies here: "
-        "dtp, atp, atp-thresholds, latency-first, work-function, cusum, LOC, PARTS, VISION, EDGE)",
+        "dtp, atp, atp-thresholds, latency-first, work-function, cusum, replicate, LOC, PARTS, "
+        "VISION, EDGE)",
         "fleet.yaml:7: cells[3].phase_ms: 50 is not allowed; it must be less than period_ms, 50",
         "fleet.yaml:8: phases: 'evn' is not allowed; it must be one of sync, even, random, or a "
         "list of ms; did you mean 'even'?",

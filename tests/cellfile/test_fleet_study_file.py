@@ -90,7 +90,7 @@ parameters:
         "study.yaml:5: scenarios[0]: canonical has no scenario 'robot-cpu-stres'; did you mean "
         "'robot-cpu-stress'?",
         "study.yaml:6: policies.dpt: unknown policy 'dpt'; did you mean 'dtp'? (policies here: "
-        "dtp, atp, atp-thresholds, latency-first, work-function, cusum, LOC, SO, HYB)",
+        "dtp, atp, atp-thresholds, latency-first, work-function, cusum, replicate, LOC, SO, HYB)",
         "study.yaml:6: policies.tuned.controller.min_dwel: unknown key 'min_dwel'; did you mean "
         "'min_dwell'?",
         "study.yaml:7: windows: 5 is not allowed; it must be more than the 5 windows of warm-up",

@@ -18,6 +18,8 @@ from tests.dash.served import Served, serving
 
 pytestmark = in_browser
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
 #: Ends of the scales of latency, J and load, by cell.
 SCALES = """window.page.cells.map((cell) => cell.charts.scales())"""
 MARKUP = "<img src=x onerror=window.pwned=1><script>window.pwned=1</script>"
@@ -210,6 +212,26 @@ def test_a_small_screen_needs_no_scrolling_sideways(
     with opened(browser, page.address, viewport=size, color_scheme=scheme) as shown:
         settled(shown)
         assert shown.evaluate("document.documentElement.scrollWidth") <= 400
+
+
+def test_both_copies_of_a_cycle_stand_where_they_run(browser: Browser, tmp_path: Path) -> None:
+    problem = dwell.load(EXAMPLES / "replicas.yaml")
+    run = dwell.simulate(problem, policy="NOW", seed=1, windows=2, jobs=True)
+    run.save(tmp_path / "run")
+    with (
+        serving(tmp_path, tmp_path / "run") as served,
+        opened(browser, served.address) as shown,
+    ):
+        settled(shown)
+        assert shown.locator("[data-task=policy]").get_attribute("data-node") == "A"
+        assert shown.locator("[data-second=policy]").get_attribute("data-node") == "B"
+        assert shown.locator("[data-second=camera]").is_hidden()
+        shown.get_by_role("button", name="Cycles").click()
+        settled(shown)
+        assert shown.locator(".gantt .job.second").count() > 0
+        words = shown.locator(".gantt .job.second title").first.text_content()
+        assert words is not None
+        assert re.search("policy on B, .*second copy", words)
 
 
 def test_two_runs_stand_on_one_time_line(browser: Browser, tmp_path: Path) -> None:

@@ -17,6 +17,8 @@ from dwell.study.verdict import verdict_of
 from tests.cells.late_cycles import late_run, without_late_cycles
 from tests.dash.recorded import small_run
 
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
 
 @pytest.fixture(scope="module")
 def cell(run_folder: Path) -> RecordedCell:
@@ -238,3 +240,17 @@ def test_a_damaged_table_is_named(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:300])
     with pytest.raises(RunError, match=r"windows\.parquet"):
         RecordedCell(tmp_path / "run")
+
+
+def test_both_copies_of_a_cycle_are_shown(tmp_path: Path) -> None:
+    problem = dwell.load(EXAMPLES / "replicas.yaml")
+    run = dwell.simulate(problem, policy="NOW", seed=1, windows=2, jobs=True)
+    run.save(tmp_path / "run")
+    cell = RecordedCell(tmp_path / "run")
+    nodes = {one["name"]: one["nodes"] for one in cell.described()["candidates"]}
+    assert nodes["ONE"] == {"camera": ["R"], "policy": ["A"], "drive": ["R"]}
+    assert nodes["NOW"] == {"camera": ["R"], "policy": ["A", "B"], "drive": ["R"]}
+    jobs = cell.jobs(1.0, 1.1)["jobs"]
+    placed = [(job["task"], job["node"], job["second"]) for job in jobs]
+    assert ("policy", "A", False) in placed
+    assert ("policy", "B", True) in placed

@@ -51,7 +51,7 @@ def test_a_candidate_by_name_is_static_whatever_the_initial_one_is() -> None:
 
 
 def test_an_unknown_name_is_answered_with_the_nearest_and_all() -> None:
-    known = "dtp, atp, atp-thresholds, latency-first, work-function, cusum, LOC, SO, HYB"
+    known = "dtp, atp, atp-thresholds, latency-first, work-function, cusum, replicate, LOC, SO, HYB"
     expected = f"unknown policy 'dpt'; did you mean 'dtp'.*{known}"
     with pytest.raises(PolicyError, match=expected):
         by_name("dpt", problem())

@@ -15,6 +15,7 @@ import polars as pl
 import dwell
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.model import Problem
+from dwell.model.controller_settings import REPLICATE
 from dwell.model.evolve import evolve
 from dwell.policies.registry import REGISTRY as POLICIES
 
@@ -53,7 +54,8 @@ def cases(problem: Problem) -> Iterator[Case]:
             for name in problem.candidates:
                 yield Case(scenario, name, "profile", guard, "1")
             estimators = ESTIMATORS if guard == "no" else ("corrected",)
-            for policy in POLICIES:
+            # These cells have no replicas: `replicate` is as its base.
+            for policy in (name for name in POLICIES if name != REPLICATE):
                 for estimator in estimators:
                     yield Case(scenario, policy, estimator, guard, "1")
 

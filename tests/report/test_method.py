@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import dwell
 from dwell.model import (
     Constant,
     Disturbance,
@@ -82,6 +84,14 @@ def test_placements_are_those_of_the_tasks_that_can_move() -> None:
     assert rows["SO"]["perception"] == "E"
     assert "control" not in rows["SO"] or rows["SO"]["control"]
     assert cell_definitions(make_problem())["cost"].startswith("J = ")
+
+
+def test_placements_with_replicas_have_both_nodes_and_their_members() -> None:
+    problem = dwell.load(Path(__file__).parents[2] / "examples" / "replicas.yaml")
+    rows = {row["placement"]: row for row in placements_table(problem).rows}
+    assert rows["ONE"] == {"placement": "ONE", "policy": "A"}
+    assert rows["NOW"] == {"placement": "NOW", "policy": "A + B", "copies": "ONE; TWO at once"}
+    assert rows["LATER"]["copies"] == "ONE; TWO after 9.5 ms"
 
 
 def test_each_policy_and_estimator_is_told_once() -> None:

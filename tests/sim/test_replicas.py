@@ -15,7 +15,8 @@ from dwell.errors import ProblemError
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Message, Meter, Site
 from dwell.estimators.profile import Profile
-from dwell.model import Problem, QoS
+from dwell.estimators.scaling import Scaling
+from dwell.model import NodeDisturbance, Problem, QoS
 from tests.reference.test_against import Probe
 
 CELL: dict[str, Any] = {
@@ -108,6 +109,19 @@ def test_a_cancelled_copy_is_not_lost(cell: Problem) -> None:
     assert (seen.cycles.ready_ns[:, 4] == -2).sum() > 45
 
 
+@pytest.mark.parametrize("estimator", ["corrected", "scaling"])
+def test_estimators_learn_from_a_slow_copy(estimator: str) -> None:
+    scenarios = {"slow": [{"node": "A", "at_s": 10, "stress_threads": 999}]}
+    controller = {"on": "R", "decide_cycles": 50}
+    cell = from_document({**CELL, "scenarios": scenarios, "controller": controller})
+    given = Scaling(cell, {("work", "A", "B"): 0.5}) if estimator == "scaling" else estimator
+    run = dwell.simulate(cell, scenario="slow", policy="NOW", estimator=given, seed=1, windows=6)
+    last = run.decisions.row(-1, named=True)
+    assert last["est_violation_rate_ONE"] > 0.9
+    assert last["est_violation_rate_NOW"] < 0.1
+    assert last["est_violation_rate_TWO"] < 0.1
+
+
 def failing(*nodes: str) -> Problem:
     """Return the cell with a third candidate, and a scenario: nodes are down from 3 s on."""
     disturbances = [{"node": name, "at_s": 3, "for_s": 100, "down": True} for name in nodes]
@@ -164,8 +178,9 @@ def test_the_guard_leaves_replicas_of_which_neither_copy_completes_cycles() -> N
 @pytest.mark.parametrize(("down", "returns"), [("A", False), ("B", True)])
 def test_probes_of_replicas_go_through_their_first_member(down: str, returns: bool) -> None:
     problem = failing("A", "B")
-    (one,) = (item for item in problem.scenario("fails") if down != item.node)
-    others = [item for item in problem.scenario("fails") if down == item.node]
+    items = [one for one in problem.scenario("fails") if isinstance(one, NodeDisturbance)]
+    (one,) = (item for item in items if down != item.node)
+    others = [item for item in items if down == item.node]
     problem = replace(problem, scenarios={"fails": (replace(one, for_s=10.0), *others)})
     run = guarded(problem, "NOW")
     assert (run.cycles["placement"][-1] == "NOW") == returns

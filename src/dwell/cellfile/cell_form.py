@@ -63,6 +63,8 @@ from dwell.model import (
     Weights,
 )
 from dwell.model.bounds import LARGEST, MAX_COUNT, NOT_EMPTY, VALUE, Bound, Pattern
+from dwell.model.controller_settings import REPLICATE as POLICY
+from dwell.model.controller_settings import ReplicateSettings
 from dwell.model.declaration import DeclaredField, declared_fields
 from dwell.model.document import VERSION
 from dwell.model.every_placement import KEEP, RESERVED, EveryPlacement
@@ -454,9 +456,11 @@ OBJECTIVE = shape_of(
     },
 )
 _POLICY, _ESTIMATOR = _field(ControllerSettings, "policy"), _field(ControllerSettings, "estimator")
+_BASES = TextForm(known=tuple(name for name in POLICIES if name != POLICY))
+REPLICATE = shape_of(ReplicateSettings, {}, title="Replicate", instead={"base": _BASES})
 CONTROLLER = shape_of(
     ControllerSettings,
-    {},
+    {ReplicateSettings: REPLICATE},
     title="Controller",
     instead={
         "policy": key_of(_POLICY, TextForm(known=tuple(POLICIES))),

@@ -11,8 +11,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, TypeAlias
 
 from dwell.display import placement_hues
-from dwell.model import Link, Problem, Trace
+from dwell.model import Link, Placement, Problem, Trace
 from dwell.model.bounds import counted
+from dwell.model.placement import nodes_of
 from dwell.study.metric import METRICS
 
 RATE = METRICS["violation_rate"]
@@ -73,7 +74,7 @@ def cell_document(problem: Problem) -> Plain:
         ],
         "flows": [[flow.source, flow.target] for flow in pipeline.flows],
         "candidates": [
-            {"name": name, "hue": hues[name], "nodes": dict(placement)}
+            {"name": name, "hue": hues[name], "nodes": _nodes(placement)}
             for name, placement in problem.candidates.items()
         ],
         "resources": [
@@ -81,6 +82,11 @@ def cell_document(problem: Problem) -> Plain:
             for one in fabric.resources.values()
         ],
     }
+
+
+def _nodes(placement: Placement) -> dict[str, list[str]]:
+    """Return the nodes of each task: of one copy, or of both."""
+    return {task: list(nodes_of(nodes)) for task, nodes in placement.items()}
 
 
 class TimedCycle(NamedTuple):
@@ -109,6 +115,7 @@ def jobs_document(
                 **{f"{name}_ms": since(job[f"{name}_ns"]) for name in ("ready", "start", "end")},
                 "cycle": job["cycle"],
                 "shadow": bool(job.get("shadow")),
+                "second": bool(job.get("second")),
             }
             for job in jobs
         ],

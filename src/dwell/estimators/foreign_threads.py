@@ -11,7 +11,7 @@ from functools import partial
 from typing import NamedTuple
 
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import cores_of, cores_on
+from dwell.estimators.measured import cores_of, cores_on, message_columns
 from dwell.kernels.jobs import NodeJobs, SlowedJobs
 from dwell.model.fabric import Node
 from dwell.model.pipeline import Execution
@@ -141,7 +141,8 @@ class Stretches:
             cores = cores_on(self._problem, node, partial(_turns, node))
             is_fair = node.scheduler == "fair"
             jobs = NodeJobs(cores, is_fair, node.cores, spare, bursts)
-            self._on[name] = SlowedJobs(jobs, len(self._problem.pipeline.flows))
+            flows = message_columns(self._problem, next(iter(self._problem.candidates.values())))
+            self._on[name] = SlowedJobs(jobs, len(flows))
         return self._on[name]
 
 

@@ -112,7 +112,8 @@ class Scaling(Learning):
             self._keep_cycles(evidence, newest)
 
     def _keep_cycles(self, evidence: Evidence, newest: int) -> None:
-        """Keep the times of the cycles under the newest placement."""
+        """Keep the times of the cycles under the newest placement, of their first copies."""
+        tasks, flows = len(self.problem.pipeline.tasks), len(self.problem.pipeline.flows)
         active = tuple(self.problem.candidates.values())[newest].first
         rows = evidence.placement == newest
         cycles = evidence.cycles.at(rows)
@@ -121,13 +122,14 @@ class Scaling(Learning):
             cores_of(self.problem.fabric.nodes[active[name]], task.on[active[name]])
             for name, task in self.problem.pipeline.tasks.items()
         ]
+        work_ns = work_ns[:, :tasks]
         alone_ms = np.where(work_ns >= 0, work_ns, np.nan) / cores / NS_PER_MS
         for column, task in enumerate(self.problem.pipeline.tasks):
             alone_ms[:, column] = self._filled(Site(task, active[task]), alone_ms[:, column])
         limit_ns = evidence.close_ns - self._message_patience_ns
-        self._jobs, self._is_due = alone_ms, cycles.end_ns != NOT_DUE
+        self._jobs, self._is_due = alone_ms, cycles.end_ns[:, :tasks] != NOT_DUE
         sent_ns = cycles.end_ns[:, self._sources]
-        self._messages = spans_ms(sent_ns, cycles.arrived_ns, limit_ns)
+        self._messages = spans_ms(sent_ns, cycles.arrived_ns[:, :flows], limit_ns)
 
     def _filled(self, site: Site, alone_ms: Floats) -> Floats:
         """Replace unknown times by the longest known time, or by the declared 95th percentile."""
@@ -171,7 +173,8 @@ class Scaling(Learning):
         # The latency of a cycle bounds no data age.
         has_path = self.problem.objective.latency is None
         if self._active is not None and len(self._jobs) and has_path:
-            for name, placement in self.problem.candidates.items():
+            # The other copy may be faster than the first one.
+            for name, placement in self.problem.plain_candidates.items():
                 estimates[name] = self._at_least(estimates[name], placement.first, self._active)
         return estimates
 

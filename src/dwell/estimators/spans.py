@@ -31,11 +31,11 @@ def patience_ns(problem: Problem, every: int = 1) -> int:
 
 
 def task_patience_ns(problem: Problem) -> Ints:
-    """Return the patience with the jobs of each task (see `patience_ns`)."""
-    rates = problem.pipeline.rates
-    return np.array(
-        [patience_ns(problem, rates[name]) for name in problem.pipeline.tasks], np.int64
-    )
+    """Return the patience with each column of jobs in the evidence (see `patience_ns`)."""
+    rates, tasks = problem.pipeline.rates, list(problem.pipeline.tasks)
+    # In a cell with replicas the second copies follow.
+    columns = tasks * 2 if problem.replicas else tasks
+    return np.array([patience_ns(problem, rates[name]) for name in columns], np.int64)
 
 
 def flow_patience_ns(problem: Problem) -> Ints:

@@ -17,6 +17,18 @@ DECIDE_CYCLES = Bound(1, MAX_COUNT, whole=True)
 MIN_DWELL_CYCLES = Bound(0, MAX_COUNT, whole=True)
 #: N_min if the cell sets none and the estimator states no errors.
 USUAL_DWELL = 3
+#: The policy that adds a second copy of each cycle to the placement of its base.
+REPLICATE = "replicate"
+
+
+@declared("replicate")
+class ReplicateSettings:
+    """Settings of the policy `replicate`, which adds a second copy of each cycle where it pays."""
+
+    base: str = key(
+        "The policy that decides among the candidates without replicas; a candidate never moves.",
+        default="dtp",
+    )
 
 
 @declared()
@@ -75,6 +87,13 @@ class ControllerSettings:
         default=None,
         usual="`corrected`; `profile` for a placement that never moves, `latency-first` and "
         "`atp-thresholds`",
+        digested="decision",
+    )
+    replicate: ReplicateSettings = key(
+        "Settings of the policy `replicate`.",
+        default_factory=ReplicateSettings,
+        usual="base: dtp",
+        is_rare=True,
         digested="decision",
     )
     shadow_fraction: float | Literal["auto"] = key(

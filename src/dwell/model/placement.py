@@ -163,3 +163,8 @@ class Replicas(Placement):
 def nodes_of(nodes: Nodes) -> tuple[str, ...]:
     """Return the nodes of a task, of the first copy first."""
     return nodes if isinstance(nodes, tuple) else (nodes,)
+
+
+def written_nodes(nodes: Nodes) -> str:
+    """Return the nodes of a task as text: ``E``, or ``R1 + E`` for two copies."""
+    return " + ".join(nodes_of(nodes))

@@ -17,7 +17,7 @@ from dwell.errors import Fault
 from dwell.model import table_columns
 from dwell.model.bounds import CLASS_PATH, shown
 from dwell.model.chain import Chain, chain_faults
-from dwell.model.controller_settings import ControllerSettings
+from dwell.model.controller_settings import REPLICATE, ControllerSettings
 from dwell.model.every_placement import EveryPlacement, search_faults
 from dwell.model.fabric import Link, Node, accelerator_tiers, resources_of
 from dwell.model.live import LiveSettings
@@ -156,6 +156,7 @@ def find_unregistered(
         if settings.policy not in names and not CLASS_PATH.holds(settings.policy):
             known = [*policies, *names]
             yield from _unknown("controller.policy", "policy", settings.policy, known)
+        yield from _base_faults(parts, settings.replicate.base, policies)
         estimator = settings.estimator
         if estimator is not None and not CLASS_PATH.holds(estimator):
             yield from _unknown("controller.estimator", "estimator", estimator, estimators)
@@ -166,6 +167,17 @@ def find_unregistered(
         if isinstance(given, float | int) and (message := too_many_shadows(given, plain)):
             yield Fault("controller.shadow_fraction", message)
     yield from _columns(parts)
+
+
+def _base_faults(parts: CellParts, base: str, policies: Sequence[str]) -> Iterator[Fault]:
+    """Yield the faults of the base policy of `replicate`."""
+    path = "controller.replicate.base"
+    if base in (REPLICATE, *parts.replicated):
+        what = "needs a base itself" if base == REPLICATE else "has replicas"
+        yield Fault(path, f"{base} {what}; name another policy, as dtp, or a plain candidate")
+    elif not CLASS_PATH.holds(base):
+        plain = [name for name in parts.candidate_names if name not in parts.replicated]
+        yield from _unknown(path, "policy", base, [*policies, *plain])
 
 
 def _unknown(path: str, what: str, word: str, known: Collection[str]) -> Iterator[Fault]:

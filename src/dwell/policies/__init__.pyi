@@ -8,5 +8,6 @@ from .parameters import parameters_of as parameters_of
 from .protocol import MinimalPolicy as MinimalPolicy
 from .protocol import Policy as Policy
 from .registry import by_name as by_name
+from .replicate import Replicate as Replicate
 from .static import Static as Static
 from .work_function import WorkFunction as WorkFunction

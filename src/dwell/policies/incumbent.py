@@ -47,7 +47,7 @@ def check_candidates(candidates: Mapping[str, Placement]) -> FrozenDict[str, Pla
     return FrozenDict(placements)
 
 
-def check_name(field: str, name: str | None, candidates: Mapping[str, Placement]) -> str:
+def check_name(field: str, name: str | None, candidates: Mapping[str, object]) -> str:
     """Return `name`, or the first candidate's name if it is None.
 
     Raises PolicyError if no candidate has that name.
@@ -147,7 +147,8 @@ class CandidatePolicy(Proposer):
         candidate, optional if the rule does not read them. Raises MetricError, with the policy
         unchanged, if a metric or a candidate's estimate is missing.
         """
-        decision, self._standing = self.propose(observed=observed, estimates=estimates)
+        decision, after = self.propose(observed=observed, estimates=estimates)
+        self.commit(after)
         return decision
 
     def propose(

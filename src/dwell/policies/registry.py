@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, cast
 
 from dwell.errors import PolicyError
 from dwell.model.bounds import CLASS_PATH
+from dwell.model.controller_settings import REPLICATE
 from dwell.model.entry_points import class_at, class_named, names_with
 from dwell.model.semantics import nearest_of
 from dwell.model.user_classes import make_user_class
@@ -100,6 +101,13 @@ REGISTRY: Mapping[str, PolicyEntry] = MappingProxyType(
             "#7f6040",
             "CUSUM adds up the savings of another placement over windows, and moves when the sum "
             "exceeds a threshold; it has no dwell time.",
+        ),
+        REPLICATE: PolicyEntry(
+            "dwell.policies.replicate:Replicate",
+            "Replicate",
+            "#b35900",
+            "Replicate adds a second copy of each cycle to the placement of another policy (DTP), "
+            "if the copy saves more J than it costs.",
         ),
     }
 )

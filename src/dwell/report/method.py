@@ -8,9 +8,19 @@ from collections.abc import Iterable, Sequence
 from dwell.display import Measure, decimals_for, write_number
 from dwell.estimators.registry import REGISTRY as ESTIMATORS
 from dwell.estimators.registry import resolved
-from dwell.model import LinkDisturbance, Node, NodeDisturbance, Problem, Process, Trace
+from dwell.model import (
+    LinkDisturbance,
+    Node,
+    NodeDisturbance,
+    Placement,
+    Problem,
+    Process,
+    Replicas,
+    Trace,
+)
 from dwell.model.bounds import counted
 from dwell.model.disturbed import on_node
+from dwell.model.placement import written_nodes
 from dwell.policies.registry import estimator_of
 from dwell.report.formatting import OURS, percent, shown_contender, write_ms
 from dwell.report.page import Block, Definitions
@@ -78,15 +88,28 @@ def placements_table(problem: Problem, prefix: str = "") -> Table:
     """Return a table of the nodes of movable tasks in each candidate."""
     movable = [name for name, task in problem.pipeline.tasks.items() if not task.anchored]
     rows = [
-        {"placement": name, **{task: placement[task] for task in movable}}
+        {
+            "placement": name,
+            **{task: written_nodes(placement[task]) for task in movable},
+            **_copies(placement),
+        }
         for name, placement in problem.candidates.items()
     ]
     columns: Columns = [
         Text("placement", "placement", "placement"),
         *(Text(one, one) for one in movable),
+        *([Text("copies", "copies")] if problem.replicas else []),
     ]
     palette = Palette.of(problem.candidates)
     return Table(f"{prefix}candidates", "Placements", columns, rows, palette=palette)
+
+
+def _copies(placement: Placement) -> dict[str, str]:
+    """Return the members of a placement with replicas."""
+    if not isinstance(placement, Replicas):
+        return {}
+    after = f"after {write_ms(placement.after_ms)}" if placement.after_ms else "at once"
+    return {"copies": f"{placement.members[0]}; {placement.members[1]} {after}"}
 
 
 def scenarios_table(problem: Problem, names: Sequence[str], prefix: str = "") -> Table:

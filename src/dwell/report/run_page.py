@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dwell.display import Measure, decimals_for, write_number
 from dwell.model.bounds import counted
+from dwell.model.placement import written_nodes
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES, shown_reason
 from dwell.record.moves import Move, moves_in
 from dwell.report.charts import (
@@ -534,8 +535,8 @@ def _moving(header: RunHeader, name: str) -> str:
     """Return the nodes of a candidate's tasks, for the tasks on which candidates differ."""
     first = next(iter(header.problem.candidates.values()))
     return ", ".join(
-        f"{task} on {node}"
-        for task, node in header.problem.candidates[name].items()
+        f"{task} on {written_nodes(nodes)}"
+        for task, nodes in header.problem.candidates[name].items()
         if any(other.get(task) != first.get(task) for other in header.problem.candidates.values())
     )
 

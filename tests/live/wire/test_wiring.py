@@ -38,7 +38,6 @@ from dwell.model import (
     Problem,
     Replicas,
     Task,
-    Weights,
 )
 from tests.cells.generated import make_problem, random_problem
 from tests.live.memory_transport import connected, hears
@@ -257,16 +256,6 @@ def test_everything_that_is_wrong_is_said_at_once(problem: Problem) -> None:
     assert "live.hosts.R2: missing" in said
     assert "live.hosts.E.seen_from.R1.port: 65000 is above" in said
     assert "live.hosts.R1.port" not in said
-
-
-def test_a_cost_of_ages_is_refused(problem: Problem) -> None:
-    objective = replace(
-        problem.objective,
-        weights=Weights(age=1.0),
-        targets=replace(problem.objective.targets, age_ms=50.0),
-    )
-    with pytest.raises(LiveError, match=r"objective\.weights\.age: not supported"):
-        wire(replace(problem, objective=objective))
 
 
 @pytest.mark.parametrize(

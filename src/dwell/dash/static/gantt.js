@@ -38,14 +38,18 @@ export const gantt = (root, cell, page, { jobs, cycles, origin_s }) => {
     if (text !== name) label.append(draw("title", { text: name }));
     svg.append(label);
   }
+  const done = new Map(cycles.map((cycle) => [cycle.cycle, cycle.latency_ms === null ? null : cycle.release_ms + cycle.latency_ms]));
   for (const job of jobs) {
     const y = 18 + rows.get(`${job.task}@${job.node}`) * ROW;
-    const from = job.start_ms ?? job.end_ms ?? last;
-    const words = `${job.task} on ${job.node}, cycle ${job.cycle}: ready ${number(job.ready_ms, 2)}, from ${number(job.start_ms, 2)} to ${number(job.end_ms, 2)} ms, ${job.outcome}${job.shadow ? ", shadow" : ""}`;
+    // A copy that waits when the other one has completed its cycle is cancelled.
+    const cancelled = !job.shadow && job.outcome === "in_flight" && job.start_ms === null ? done.get(job.cycle) ?? null : null;
+    const from = job.start_ms ?? job.end_ms ?? cancelled ?? last;
+    const outcome = cancelled === null ? job.outcome : "cancelled";
+    const words = `${job.task} on ${job.node}, cycle ${job.cycle}: ready ${number(job.ready_ms, 2)}, from ${number(job.start_ms, 2)} to ${number(job.end_ms, 2)} ms, ${outcome}${job.shadow ? ", shadow" : ""}${job.second ? ", second copy" : ""}`;
     if (from - job.ready_ms > 0.01)
       svg.append(draw("line", { class: "wait", x1: clipped(x(job.ready_ms)), y1: y + 8, x2: clipped(x(from)), y2: y + 8 }));
     if (job.start_ms === null || x(from) >= width - RIGHT) continue;
-    const kind = [job.cycle % 2 ? "odd" : "", job.shadow ? "shadow" : "", job.outcome === "done" ? "" : "lost"];
+    const kind = [job.cycle % 2 ? "odd" : "", job.shadow ? "shadow" : "", job.second ? "second" : "", job.outcome === "done" ? "" : "lost"];
     const [at, until] = [clipped(x(from)), clipped(x(job.end_ms ?? last))];
     const box = { x: at, y: y + 2, width: Math.max(until - at, 1), height: ROW - 6, rx: 2 };
     svg.append(draw("rect", { class: `job ${kind.join(" ")}`, ...box }, draw("title", { text: words })));

@@ -78,7 +78,13 @@ export class Topology {
         svg.append(draw("rect", { class: "slot", x, y: top, width, height: SLOT - 6, rx: 4 }), name);
       }
     this.stages = new Map(tasks.map((task, i) => [task.name, this.stage(task, i)]));
-    svg.append(...this.stages.values());
+    this.seconds = new Map(tasks.map((task, i) => [task.name, this.stage(task, i)]));
+    for (const [name, group] of this.seconds) {
+      group.classList.add("second");
+      group.removeAttribute("data-task");
+      group.dataset.second = name;
+    }
+    svg.append(...this.stages.values(), ...this.seconds.values());
     svg.style.maxWidth = `${wide}px`;
     this.root.replaceChildren(svg);
   }
@@ -144,27 +150,29 @@ export class Topology {
     return group;
   }
 
-  /** Move each stage to its computer, and show the load of each computer. */
+  /** Move the box of a stage to a computer; without a computer, hide it. */
+  place(group, task, node, hue) {
+    group.style.visibility = node === undefined ? "hidden" : "visible";
+    if (node === undefined) return;
+    const [x, y, width] = this.slots.get(`${task.name}@${node}`);
+    group.style.transform = `translate(${x}px, ${y}px)`;
+    group.style.setProperty("--hue", hue);
+    group.dataset.node = node;
+    group.firstChild.setAttribute("width", width);
+  }
+
+  /** Move each stage to its computers, and show the load of each computer. */
   show(state) {
     this.state = state;
     const candidate = this.cell.candidates.find(({ name }) => name === state.placement);
     const words = [];
     for (const task of this.cell.tasks) {
-      // With replicas a task may run on two nodes; the stage is on the node of the first copy.
-      const nodes = [candidate?.nodes[task.name] ?? task.on[0]].flat();
-      const node = nodes[0];
-      const [x, y, width] = this.slots.get(`${task.name}@${node}`);
-      const group = this.stages.get(task.name);
-      group.style.transform = `translate(${x}px, ${y}px)`;
-      group.style.setProperty("--hue", candidate?.hue ?? "gray");
-      group.dataset.node = node;
-      group.firstChild.setAttribute("width", width);
-      for (const other of task.on) {
-        const classes = this.possible.get(`${task.name}@${other}`).classList;
-        classes.toggle("taken", other === node);
-        classes.toggle("copy", other !== node && nodes.includes(other));
-      }
-      words.push(`${task.name} on ${nodes.join(" and ")}`);
+      const on = candidate?.nodes[task.name] ?? [task.on[0]];
+      const hue = candidate?.hue ?? "gray";
+      this.place(this.stages.get(task.name), task, on[0], hue);
+      this.place(this.seconds.get(task.name), task, on[1], hue);
+      for (const other of task.on) this.possible.get(`${task.name}@${other}`).classList.toggle("taken", on.includes(other));
+      words.push(`${task.name} on ${on.join(" and ")}`);
     }
     const drained = new Set(state.drained ?? []);
     for (const [name, parts] of this.nodes) {
