@@ -45,7 +45,7 @@ def test_the_head_lists_the_keys_of_a_first_cell(here: Path) -> None:
 
 def test_a_new_live_cell_runs_under_its_own_policy(here: Path) -> None:
     assert "dwell live run cell.yaml" in call("new", "hall", "--from", "live").stdout
-    words = ("live", "run", "hall/cell.yaml", "--seconds", "6", "--out", "out")
+    words = ("live", "run", "hall/cell.yaml", "--seconds", "5", "--out", "out")
     found = subprocess.run(
         (sys.executable, "-m", "dwell", *words, "--policy", "policy:Patient"),
         capture_output=True,

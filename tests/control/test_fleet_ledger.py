@@ -19,7 +19,7 @@ from dwell.control.fleet_rank import MostServed
 from dwell.control.ledger import FleetLedger, Loads, PricedCell, Seat
 from dwell.estimators.load_table import LoadColumn, LoadTable
 from dwell.estimators.present import Present
-from dwell.model import Decision, FrozenDict, Problem, QoS
+from dwell.model import Decision, FrozenDict, MissCap, Problem, QoS
 from dwell.model.fleet import FleetObjective
 from dwell.model.process import Constant
 from dwell.model.qos import Reason
@@ -172,16 +172,22 @@ def test_at_least_as_many_cells_are_served_as_by_the_other_objectives() -> None:
     assert served["served"] == max(served.values()) == 2
 
 
-def test_no_cell_is_moved_over_a_cap_of_another_one() -> None:
+@pytest.mark.parametrize("capped", ["latency", "misses"])
+def test_no_cell_is_moved_over_a_cap_of_another_one(capped: str) -> None:
     problem = stressed(with_cores(CANONICAL, 2))
     # All at once, so that two on E are in each other's way.
     cells = [replace(cell, problem=problem) for cell in cells_of(problem, 3)]
     plain = FleetLedger(cells, ["E"])
     seen = [plain.prices.price(("HYB", name, "LOC")).cells[0] for name in ("LOC", "HYB")]
     alone_ms, beside_ms = (cell.qos.l95_ms for cell in seen if cell is not None)
-    caps = replace(problem.objective.caps, latency_ms=(alone_ms + beside_ms) / 2)
+    between_ms = (alone_ms + beside_ms) / 2
+    caps = replace(problem.objective.caps, latency_ms=between_ms)
     assert alone_ms + 1 < beside_ms
-    tight = replace(problem, objective=replace(problem.objective, caps=caps))
+    tight = problem
+    if capped == "misses":
+        caps = replace(problem.objective.caps, misses=MissCap(2, 20))
+        tight = replace(problem, pipeline=replace(problem.pipeline, deadline_ms=between_ms))
+    tight = replace(tight, objective=replace(problem.objective, caps=caps))
     wished = priced(problem, "LOC", "HYB", dict.fromkeys(problem.candidates, 0.0))
     answers = []
     for first in (cells[0], replace(cells[0], problem=tight)):

@@ -9,10 +9,12 @@ import pytest
 import dwell
 from dwell.cost import excess
 from dwell.estimators.candidate_player import CandidatePlayer
+from dwell.estimators.fleet_prices import FleetPrices, PricedCell
 from dwell.estimators.prices import Question, price_of, prices_of
 from dwell.kernels.random_draws import draw
 from dwell.model import (
     Caps,
+    Chain,
     Constant,
     Execution,
     MissCap,
@@ -51,7 +53,22 @@ def test_a_price_equals_a_static_run_on_the_same_realisation(latency: str | None
         assert found.age is not None
         assert found.age[0] == pytest.approx(windows["seen_age_ms"].mean(), rel=1e-12)
         if latency is not None:
-            assert found.uncut_l95_ms >= found.l95_ms
+            age_ms = windows["age_l95_see-act"].mean()
+            assert found.uncut_l95_ms == pytest.approx(age_ms, rel=1e-3)
+
+
+def test_an_age_above_the_bound_for_j_is_over_the_cap() -> None:
+    problem = with_ages(dwell.load("examples/inner-loop.yaml"))
+    chains = {"see-act": Chain("camera", "control", 20)}
+    objective = replace(problem.objective, caps=Caps(latency_ms=100))
+    problem = replace(
+        problem, pipeline=replace(problem.pipeline, chains=chains), objective=objective
+    )
+    # The age is about 153 ms; J counts 100 ms.
+    price = prices_of(problem)["EDGE"]
+    assert price.l95_ms == problem.censor_ms == 100
+    assert price.uncut_l95_ms > 140
+    assert excess(price.qos, problem.objective) > 0.4
 
 
 def test_what_an_objective_measures_is_part_of_a_prices_key() -> None:
@@ -116,3 +133,33 @@ def test_the_stretches_of_measured_conditions_are_long_enough() -> None:
     )
     last = run.decisions.row(-1, named=True)
     assert 0.1 < last["est_misses_LOC"] <= 1.0
+
+
+def test_a_fleet_counts_stretches_as_the_price_of_a_cell_alone() -> None:
+    problem = missing(0.05)
+    longer = replace(problem.objective, caps=Caps(misses=MissCap(m=20, k=600)))
+    cells = [PricedCell("a", problem), PricedCell("b", replace(problem, objective=longer))]
+    price = FleetPrices(cells, ["E"]).price(("LOC", "OFF"))
+    capped, other = (price.qos(i) for i in range(2))
+    assert capped is not None
+    assert other is not None
+    assert capped.misses == pytest.approx(prices_of(problem)["LOC"].misses, rel=0.4)
+    assert excess(capped, problem.objective) > 0 == other.misses
+    assert price.cells[0] is not None
+    # Both cells play the 20 stretches of the longer cap.
+    assert len(price.cells[0].windows) * problem.window_cycles >= 20 * 600
+
+
+def test_stretches_count_data_that_are_too_old() -> None:
+    problem = dwell.load("examples/inner-loop.yaml")
+    capped = replace(problem.objective, caps=Caps(misses=MissCap(1, 20)))
+    shares = []
+    for max_age_ms in (180.0, 140.0):
+        # The age of a picture is about 150 ms at the last command before the next one.
+        chains = {"see-act": Chain("camera", "control", max_age_ms)}
+        pipeline = replace(problem.pipeline, chains=chains)
+        cell = replace(problem, pipeline=pipeline, objective=capped)
+        of_fleet = FleetPrices([PricedCell("a", cell)], ["E"]).price(("EDGE",)).qos(0)
+        assert of_fleet is not None
+        shares.append((prices_of(cell)["EDGE"].misses, of_fleet.misses))
+    assert shares == [(0.0, 0.0), (1.0, 1.0)]

@@ -105,6 +105,13 @@ def guarded(**settings: Any) -> dict[str, Any]:
     return cell(controller={"guard_cycles": 5, **settings})
 
 
+def watched(max_age_ms: float, objective: Any = None) -> dict[str, Any]:
+    """Return a guarded chain of one rate, whose age is 14 ms on the edge server."""
+    chains = {"seen": {"from": "cam", "to": "act", "max_age_ms": max_age_ms}}
+    settings = {"guard_cycles": 2, "fallbacks": ["LOC"]}
+    return cell(controller=settings, chains=chains, objective=objective or {"weights": {}})
+
+
 def disturbed(*items: Mapping[str, Any]) -> dict[str, Any]:
     return cell(scenarios={"s": list(items)})
 
@@ -190,6 +197,17 @@ LINK = {"link": "R->E"}
             "controller.fallbacks",
             ("no fallback without E", "add LOC"),
         ),
+        (watched(13), "chains.seen.max_age_ms", ("13 is tight for SO", "14.0 ms", "13.0 ms")),
+        (
+            watched(13, {"latency": "seen"}),
+            "chains.seen.max_age_ms",
+            ("13 is tight for SO", "two runs of act"),
+        ),
+        (
+            {**watched(500, {"latency": "seen"}), "links": [{**LINKS[0], "delay_ms": 60}]},
+            "controller.guard_cycles",
+            ("2 is tight for SO", "132.0 ms"),
+        ),
         (prioritised(), "tasks.rt.priority", ("no effect on E", "shares with big")),
         (prioritised("fifo"), "tasks.rt.priority", ("scheduler: priority",)),
         (
@@ -272,6 +290,8 @@ def test_what_is_never_meant_is_said(
         servo(5),
         guarded(fallbacks=["SO", "LOC"], initial="SO"),
         guarded(),
+        watched(15),
+        watched(15, {"latency": "seen"}),
         cell(controller={"decide_cycles": 5, "min_dwell_cycles": 5}),
         cell(controller={"decide_cycles": 5, "min_dwell_cycles": 0}),
         prioritised("priority"),

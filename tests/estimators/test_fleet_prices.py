@@ -22,6 +22,8 @@ from tests.cells.once import with_windows
 EXAMPLES = Path(__file__).parents[2] / "examples"
 CANONICAL = dwell.load(EXAMPLES / "canonical.yaml")
 FAN_IN = dwell.load(EXAMPLES / "fan-in.yaml")
+LINKS = {name: replace(link, price_per_gb=0.5) for name, link in CANONICAL.fabric.links.items()}
+WITH_PRICES = replace(CANONICAL, fabric=replace(CANONICAL.fabric, links=LINKS))
 
 
 def fleet_of(*entries: FleetEntry, shared: tuple[str, ...] = ("E",)) -> Fleet:
@@ -44,7 +46,7 @@ def cell_of(price: FleetPrice, index: int) -> CellPrice:
 
 
 def test_a_fleet_is_priced_as_the_simulator_plays_it() -> None:
-    entries = [FleetEntry(CANONICAL, 2, policy="SO"), FleetEntry(CANONICAL, 1, policy="HYB")]
+    entries = [FleetEntry(WITH_PRICES, 2, policy="SO"), FleetEntry(WITH_PRICES, 1, policy="HYB")]
     fleet = fleet_of(*entries)
     price = priced(fleet).price(("SO", "SO", "HYB"))
     run = simulate_fleet(fleet, seed=SEED, windows=9)
@@ -54,6 +56,7 @@ def test_a_fleet_is_priced_as_the_simulator_plays_it() -> None:
         assert seen.l95_ms == pytest.approx(windows["seen_l95_ms"].mean(), rel=1e-12)
         assert seen.violation_rate == pytest.approx(windows["seen_violation_rate"].mean())
         assert seen.utilisation["R1"] == pytest.approx(windows["u_R1"].mean())
+        assert seen.price_per_hour == pytest.approx(windows["seen_price_per_hour"].mean())
     first = next(iter(run.cells.values())).windows[1:]
     assert price.used == {"E": pytest.approx(first["u_E"].mean())}
 

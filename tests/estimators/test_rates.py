@@ -117,6 +117,18 @@ def test_a_time_between_decisions_without_a_run_of_a_sink_is_a_warning() -> None
     assert "controller.decide_cycles" in warned(cell)
 
 
+@pytest.mark.parametrize(("max_age_ms", "expected"), [(1, True), (25, True), (80, False)])
+@pytest.mark.parametrize("latency", [None, "see"])
+def test_a_chain_that_the_guard_does_not_wait_for_long_enough_is_a_warning(
+    max_age_ms: float, expected: bool, latency: str | None
+) -> None:
+    """The picture behind a command is up to 150 ms old on the edge server."""
+    chains = {"see": {"from": "camera", "to": "control", "max_age_ms": max_age_ms}}
+    cell = inner_loop(chains=chains, controller={"guard_cycles": 2, "fallbacks": ["LOC"]})
+    cell["objective"] |= {"latency": latency} if latency else {}
+    assert ("chains.see.max_age_ms" in warned(cell)) == expected
+
+
 def test_an_offset_beyond_the_deadline_is_a_warning_on_the_way_to_a_sink_only() -> None:
     cell = inner_loop()
     cell["tasks"]["imu"] = {**cell["tasks"]["imu"], "offset_ms": 8}

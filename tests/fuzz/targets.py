@@ -53,7 +53,7 @@ KINDS: tuple[type[msgspec.Struct], ...] = tuple(
 )
 STAMP = messages.Stamp(1, 5, 1, "LOC", 0)
 HOP = messages.Hop("sensing", "R1", 1, 2, 3, (("stamper", 1),))
-ORIGIN = messages.Origin("sensing", 5, 0)
+ORIGIN = messages.Origin("sensing", 5, 0, 5)
 RATED_HOP = messages.RatedHop(**msgspec.structs.asdict(HOP), origins=(ORIGIN,))
 
 

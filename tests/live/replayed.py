@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import polars as pl
 import pytest
@@ -17,12 +18,23 @@ from dwell.estimators import Profile
 from dwell.live.roles.live_windows import LiveWindows
 from dwell.live.roles.offsets import Offsets
 from dwell.live.roles.run_rows import Rows, columns_of
-from dwell.live.wire.messages import ACTUATED, BEHIND, Completion, Hop, Load, Stamp
+from dwell.live.wire.messages import (
+    ACTUATED,
+    BEHIND,
+    Completion,
+    Hop,
+    Load,
+    Origin,
+    RatedHop,
+    Stamp,
+)
 from dwell.model import FrozenDict, Problem, QoS
 from dwell.record import Journal, Run, seal_run
 from dwell.sim import engine
 
 UNKNOWN = -1
+#: Number of the first stamp.
+FIRST = 5000
 
 
 @dataclass(slots=True)
@@ -63,7 +75,9 @@ class Played:
     seen: Seen
 
 
-def simulate(problem: Problem, scenario: str, windows: int = 25, seed: int = 5) -> Played:
+def simulate(
+    problem: Problem, scenario: str, windows: int = 25, seed: int = 5, *, guard: bool = False
+) -> Played:
     """Simulate a run and keep what its controller was given."""
     kept: list[tuple[Seen, engine.SimulatedStamper]] = []
     consult, every = engine.SimulatedStamper.consult, problem.decide_cycles
@@ -98,7 +112,9 @@ def simulate(problem: Problem, scenario: str, windows: int = 25, seed: int = 5) 
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine.SimulatedStamper, "consult", spy)
-        run = dwell.simulate(problem, scenario=scenario, seed=seed, windows=windows, jobs=True)
+        run = dwell.simulate(
+            problem, scenario=scenario, seed=seed, windows=windows, jobs=True, guard=guard
+        )
     seen, stamper = kept[0]
     if often:
         tables = stamper.arrays.tables
@@ -159,6 +175,7 @@ def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list
                 through[first + row] = names[code]
                 discarded[first + row] = int(evidence.shadows.arrived_ns[row, -1])
     hops: dict[tuple[int, bool], list[Hop]] = {}
+    sensing, release_ns = next(iter(problem.pipeline.tasks)), run.arrays("cycles")["release_ns"]
     jobs = run.jobs.filter(pl.col("end_ns").is_not_null(), pl.col("outcome") == "done")
     for job in jobs.sort("cycle", "ready_ns", "end_ns").iter_rows(named=True):
         task, node = job["task"], job["node"]
@@ -168,6 +185,10 @@ def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list
         whose = job["cycle"], bool(job.get("shadow"))
         cpu_ns = work_ns.get((*whose, task), UNKNOWN)
         hop = Hop(task, node, ready_ns, start_ns, end_ns, inputs, cpu_ns=cpu_ns)
+        if problem.pipeline.chains:
+            number, released_ns = FIRST + job["cycle"], int(release_ns[job["cycle"]])
+            origins = (Origin(sensing, number, released_ns, number),)
+            hop = RatedHop(**msgspec.structs.asdict(hop), origins=origins)
         hops.setdefault(whose, []).append(hop)
     events: list[Event] = []
     term, before = 1, None
@@ -177,7 +198,7 @@ def messages_of(played: Played, clocks: Clocks, work_ns: Work = NO_WORK) -> list
         cycle, placement, released_ns = entry["cycle"], entry["placement"], entry["release_ns"]
         term += before is not None and placement != before
         before = placement
-        stamp = Stamp(7, 5000 + cycle, term, placement, released_ns, through.get(cycle, ""))
+        stamp = Stamp(7, FIRST + cycle, term, placement, released_ns, through.get(cycle, ""))
         events.append((released_ns, 3, stamping(stamp)))
         if entry["latency_ns"] is not None:
             done_ns = released_ns + entry["latency_ns"]

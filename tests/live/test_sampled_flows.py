@@ -278,21 +278,29 @@ def test_recorded_ages_are_those_of_the_jobs(tmp_path: Path) -> None:
     world.run(600)
     sampled = {inputs["imu"].cycle: inputs.get("detect") for inputs in log.inputs}
     age_ms: dict[int, float] = {}
-    first = origin = 0
+    reactions_ms: dict[int, list[float]] = {}
+    first = origin = newest = 0
     for completion in (decode(sample.payload, RatedCompletion) for sample in done):
         stamp = completion.stamp
         first = first or stamp.released_ns - stamp.cycle * P_MS * MS
         value = sampled[stamp.cycle]
         origin = origin if value is None else value.cycle
-        age_ms[stamp.cycle] = (completion.done_ns - first) / MS - origin * P_MS
+        at_ms = (completion.done_ns - first) / MS
+        age_ms[stamp.cycle] = at_ms - origin * P_MS
+        waited = [at_ms - one * P_MS for one in range(newest, origin, SLOW)]
+        reactions_ms[stamp.cycle], newest = waited, max(newest, origin)
     numbers = [number for (number,) in columns(world, "cycles", "number")]
-    windows = columns(world, "windows", "first_cycle", "age_l95_see-act", "age_missed_see-act")
+    names = (f"{of}_see-act" for of in ("age_l95", "age_missed", "reaction_l95"))
+    windows = columns(world, "windows", "first_cycle", *names)
     assert len(windows) >= 3
-    for row, l95_ms, missed in windows:
+    for row, l95_ms, missed, reaction_ms in windows:
+        waits = [ms for number in numbers[row : row + 20] for ms in reactions_ms[number]]
+        assert reaction_ms == pytest.approx(max(waits))
+        assert len(waits) >= 3
         ages = [age_ms[number] for number in numbers[row : row + 20]]
         assert l95_ms == pytest.approx(sorted(ages)[18])
         assert missed == sum(age > 50 for age in ages) / 20
-    assert any(missed for _, _, missed in windows)
+    assert any(missed for _, _, missed, _ in windows)
 
 
 def test_a_cycle_whose_data_are_too_old_is_missed() -> None:

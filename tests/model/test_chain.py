@@ -68,7 +68,23 @@ def test_a_bad_name_of_a_chain_is_a_fault() -> None:
     assert fault.startswith("chains.a/b")
 
 
+def test_the_target_of_a_chain_that_counts_as_latency_is_its_largest_age() -> None:
+    ends = {"from": "camera", "to": "control"}
+
+    def target_ms(objective: dict[str, Any]) -> float:
+        chains = {"see": {**ends, "max_age_ms": 150}, "free": ends}
+        return from_document(
+            {**cell(**chains), "objective": objective}
+        ).objective.targets.latency_ms
+
+    assert target_ms({"latency": "see"}) == 150
+    assert target_ms({"latency": "see", "targets": {"robot": 0.5}}) == 150
+    assert target_ms({"latency": "see", "targets": {"latency_ms": 60}}) == 60
+    # Without such a chain, or without its bound, the deadline counts.
+    assert target_ms({}) == target_ms({"latency": "free"}) == 10
+
+
 def test_chains_have_columns_of_windows() -> None:
     problem = from_document(cell(see={"from": "camera", "to": "control"}))
-    columns = [name for name in column_types("windows", problem) if name.startswith("age")]
-    assert columns == ["age_l95_see", "age_missed_see"]
+    columns = [name for name in column_types("windows", problem) if name.endswith("_see")]
+    assert columns == ["age_l95_see", "age_missed_see", "reaction_l95_see"]

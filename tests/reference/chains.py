@@ -19,6 +19,7 @@ class Actuation:
     cycle: int
     at_ns: int
     age_ns: int
+    newest: int = -1
 
     @property
     def born_ns(self) -> int:
@@ -43,9 +44,24 @@ def actuations(
         return result.jobs[cycle, task].taken
 
     for at_ns, cycle in done:
-        origin = min(rates.descent(taken, start, end, cycle), default=origin)
-        found.append(Actuation(cycle, at_ns, at_ns - release_ns[origin]))
+        descent = rates.descent(taken, start, end, cycle)
+        origin = min(descent, default=origin)
+        newest = max(descent, default=-1)
+        found.append(Actuation(cycle, at_ns, at_ns - release_ns[origin], newest))
     return found
+
+
+def reaction_l95_ms(
+    known: Sequence[Actuation], release_ns: Sequence[int], every: int, cycles: range
+) -> float:
+    """Return L95 of the reaction times that end at the actuations of some cycles."""
+    found = []
+    for release in range(0, len(release_ns), every):
+        ends = next((one for one in known if one.newest > release), None)
+        if ends is not None and ends.cycle in cycles:
+            found.append(ends.at_ns - release_ns[release])
+    found.sort()
+    return found[math.ceil(0.95 * len(found)) - 1] / 1e6 if found else math.inf
 
 
 def bound_ns(chain: Chain) -> float:

@@ -18,7 +18,9 @@ from tests.reference.chains import (
     bound_ns,
     completions,
     mean_age_ms,
+    reaction_l95_ms,
 )
+from tests.reference.rates import Rates
 from tests.reference.simulator import Result
 from tests.reference.test_against import (
     Case,
@@ -49,19 +51,19 @@ def with_chains(problem: Problem, rng: Random) -> Problem:
 def differences(case: Case, windows: object, result: Result) -> Iterator[str]:
     width, release_ns = case.problem.window_cycles, case.real.release_ns.tolist()
     for name, chain in case.problem.pipeline.chains.items():
-        known = {
-            one.cycle: one.age_ns
-            for one in actuations(case.problem, result, release_ns, chain.source, chain.target)
-        }
+        acted = actuations(case.problem, result, release_ns, chain.source, chain.target)
+        every = Rates(case.problem.pipeline).of[chain.source]
+        known = {one.cycle: one.age_ns for one in acted}
         for row in windows.iter_rows(named=True):  # type: ignore[attr-defined]
             cycles = range(row["first_cycle"], row["first_cycle"] + width)
             ages = sorted(known[k] for k in cycles if k in known)
             l95 = ages[math.ceil(0.95 * len(ages)) - 1] / 1e6 if ages else math.inf
             over = sum(age > bound_ns(chain) for age in ages)
             missed = over / len(ages) if ages else 1.0
-            found = row[f"age_l95_{name}"], row[f"age_missed_{name}"]
-            if found != (l95, missed):
-                yield f"window {row['window']}, {name}: {found}, expected {(l95, missed)}"
+            expected = l95, missed, reaction_l95_ms(acted, release_ns, every, cycles)
+            found = tuple(row[f"{of}_{name}"] for of in ("age_l95", "age_missed", "reaction_l95"))
+            if found != expected:
+                yield f"window {row['window']}, {name}: {found}, expected {expected}"
 
 
 @pytest.mark.parametrize("whole_ms", [False, True], ids=["continuous", "whole"])

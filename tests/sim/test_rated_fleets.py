@@ -78,9 +78,10 @@ def test_a_fleet_of_one_is_that_cell(problem: Problem, scenario: str, coordinati
         assert_frame_equal(getattr(run, table), getattr(alone, table))
 
 
-def test_cells_that_share_nothing_are_as_alone() -> None:
-    """The second cell has forwards of its own; the last windows of both close together."""
-    second = loop(deadline_ms=40)
+@pytest.mark.parametrize("ends_together", [True, False])
+def test_cells_that_share_nothing_are_as_alone(ends_together: bool) -> None:
+    """The second cell has forwards of its own."""
+    second = loop(deadline_ms=40 if ends_together else 7)
     fleet = hall(FleetEntry(late()), FleetEntry(second, 1, "stress"), shared=())
     asked: dict[str, Any] = {"policy": "dtp+corrected", "seed": 3, "jobs": True}
     runs = [*dwell.simulate_fleet(fleet, windows=5, phases="sync", **asked).cells.values()]
@@ -90,7 +91,8 @@ def test_cells_that_share_nothing_are_as_alone() -> None:
     ]
     assert alone[1].decisions["migrated"].any()
     for run, one in zip(runs, alone, strict=True):
-        for table in TABLES:
+        # The last cycles of a cell that ends first go on while the other cell is simulated.
+        for table in TABLES if ends_together else ("decisions",):
             assert_frame_equal(getattr(run, table), getattr(one, table))
 
 

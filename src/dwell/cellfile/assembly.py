@@ -15,6 +15,7 @@ from dwell.errors import Fault
 from dwell.estimators import registry as estimators
 from dwell.model import (
     Caps,
+    Chain,
     ControllerSettings,
     Disturbance,
     Execution,
@@ -107,7 +108,7 @@ class Assembly:
         tasks = {name: self._task(name, task) for name, task in entry.tasks.items()}
         links, flows = list(self._links()), list(self._flows())
         timing = self._timing()
-        objective = self._objective(nodes)
+        objective = self._objective(nodes, timing.chains if timing is not None else {})
         controller, servo = self._section("controller", ControllerSettings), self._servo()
         live, scenarios = self._live(timing), self._scenarios()
         named, every = entry.candidates.named, self._made(entry.candidates.every)
@@ -292,14 +293,19 @@ class Assembly:
         ends = {"source": source.strip(), "target": target.strip()}
         return self._make(entry, LinkDisturbance, **values, **ends)
 
-    def _objective(self, nodes: Mapping[str, Node | None]) -> Objective | None:
+    def _objective(
+        self, nodes: Mapping[str, Node | None], chains: Mapping[str, Chain]
+    ) -> Objective | None:
         entry = self.entry.objective or Entry(OBJECTIVE, "objective", {})
-        deadline_ms = self.entry.deadline_ms or self.entry.period_ms
+        target_ms = self.entry.deadline_ms or self.entry.period_ms
+        chain = chains.get(entry.latency) if entry.latency is not None else None
+        if chain is not None and chain.is_bounded:
+            target_ms = chain.max_age_ms
         tiers = entry.tiers
         if tiers is None:
             tiers = {name: node.tier for name, node in nodes.items() if node is not None}
         given = entry.targets.values if entry.targets is not None else {}
-        targets = self._make(entry, Targets, **{"latency_ms": deadline_ms, **given})
+        targets = self._make(entry, Targets, **{"latency_ms": target_ms, **given})
         weights, caps = self._made(entry.weights), self._made(entry.caps)
         if targets is None:
             return None

@@ -17,8 +17,10 @@ from dwell.control.windows import (
     age_l95_ms,
     age_missed,
     final_l95_ms,
+    mean_age_ms,
     moved_shares,
     overtaken_cycles,
+    reactions,
     seen_costs,
 )
 from dwell.estimators import Estimator, Evidence, Instants
@@ -46,10 +48,12 @@ __all__ = [
     "age_l95_ms",
     "age_missed",
     "final_l95_ms",
+    "mean_age_ms",
     "moved_shares",
     "overtaken_cycles",
     "parts_of",
     "plain_rule",
+    "reactions",
     "seen_costs",
     "shadow_stamps",
 ]

@@ -17,6 +17,7 @@ from dwell.control.coordination import Asked, Coordination, Verdict, Wish
 from dwell.control.course import Course
 from dwell.control.watchdog import Doubts, Expected, SeenWindow, Watchdog
 from dwell.control.windows import (
+    age_l95_ms,
     missed_cycles,
     seen_costs,
     seen_l95_ms,
@@ -86,6 +87,11 @@ class ClosedWindow:
         The window's cycles since the last decision, for the estimator; None for the whole window.
     over_age : bool array, shape (W,), optional
         Whether the data of each cycle's actuation were older than a chain's `max_age_ms`.
+    ages_ns : int64 array, shape (n,), optional
+        Data age at each cycle's actuation of the chain `objective.latency`, `NO_AGE` where it is
+        unknown; None without such a chain.
+    age_ms : float, optional
+        Mean age of the newest command, if J weighs it.
     """
 
     latency_ns: Ints
@@ -97,6 +103,8 @@ class ClosedWindow:
     evidence: Callable[[], Evidence] | None = None
     recent: ClosedWindow | None = None
     over_age: NDArray[np.bool_] | None = None
+    ages_ns: Ints | None = None
+    age_ms: float | None = None
 
     def __repr__(self) -> str:
         return f"<ClosedWindow of {len(self.latency_ns)} cycles>"
@@ -323,13 +331,16 @@ class Controller:
         if evidence is not None:
             self.learn(evidence)
         recent = None if window.recent is None else self.utilisation(window.recent)
-        return self.propose_on(*metrics, shares, recent)
+        return self.propose_on(*metrics, shares, recent, window.age_ms)
 
     def _metrics(self, window: ClosedWindow) -> tuple[float, float, float]:
         """Return L95 known at the end of the window (ms), V_D, and L95 for caps (ms)."""
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns, window.over_age))
         l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
+        if window.ages_ns is not None:
+            uncut_ms = age_l95_ms(window.ages_ns[None])[0]
+            l95_ms = np.minimum(uncut_ms, round(self._censor_ms * 1e6) / 1e6)
         return float(l95_ms), missed / len(age_ns), float(uncut_ms)
 
     def seen(self, window: ClosedWindow, names: Iterable[str]) -> tuple[float, float, float]:
@@ -345,7 +356,8 @@ class Controller:
         l95_ms, violation_rate, _ = self._metrics(window)
         busy = dict(zip(self.resources, self.utilisation(window)[0, :, None], strict=True))
         of = np.array([l95_ms]), np.array([violation_rate]), busy, np.array([moved])
-        return l95_ms, violation_rate, float(seen_costs(self.problem, *of)[0])
+        age_ms = window.age_ms or 0.0
+        return l95_ms, violation_rate, float(seen_costs(self.problem, *of, age_ms)[0])
 
     def propose_on(
         self,

@@ -6,7 +6,7 @@ the simulator's kernel (``metrics.h``) therefore compute the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,6 +124,62 @@ def age_missed(ages_ns: Ints, max_age_ns: int) -> Floats:
     over: NDArray[np.bool_] = is_known & (ages_ns > max_age_ns)
     share: Floats = np.where(count > 0, over.sum(axis=1) / np.maximum(count, 1), 1.0)
     return share
+
+
+def mean_age_ms(
+    commands: Iterable[tuple[int, int]], open_ns: int, close_ns: int, censor_ms: float
+) -> float:
+    """Return the mean over time of the age of the newest command in effect.
+
+    The arithmetic is the kernel's. Before the first command the age counts from instant 0.
+
+    Parameters
+    ----------
+    commands : iterable of (int, int)
+        Instant of each command, and the release from which its age counts, from the newest cycle
+        to the oldest.
+    open_ns, close_ns : int
+        Begin and end of the time.
+    censor_ms : float
+        `Problem.censor_ms`; an age counts for no more.
+    """
+    most_ns = round(censor_ms * 1e6) / 1e6 * 1e6
+
+    def area(from_ns: float, until_ns: float) -> float:
+        turn = min(max(most_ns, from_ns), until_ns)
+        return (from_ns + turn) / 2 * (turn - from_ns) + most_ns * (until_ns - turn)
+
+    total, until_ns = 0.0, close_ns
+    for at_ns, born_ns in (*commands, (open_ns, 0)):
+        if until_ns <= open_ns:
+            break
+        if at_ns < until_ns:
+            from_ns = max(at_ns, open_ns)
+            total += area(float(from_ns - born_ns), float(until_ns - born_ns))
+            until_ns = from_ns
+    return total / float(close_ns - open_ns) / 1e6
+
+
+def reactions(at_ns: Ints, newest: Ints, every: int, since: int) -> Iterator[tuple[int, int]]:
+    """Yield releases of a chain's first task, and the places of the actuations that end their wait.
+
+    A release waits for the first actuation that descends from a later cycle of the task.
+
+    Parameters
+    ----------
+    at_ns, newest : int64 array, shape (n,)
+        Instant of each actuation, and the newest cycle that it descends from, -1 for none. They
+        are in the order of their cycles; `NEVER_NS` where there is no actuation.
+    every : int
+        Cycles from one release of the task to its next.
+    since : int
+        First release that waits.
+    """
+    for place in np.lexsort((np.arange(len(at_ns)), at_ns)).tolist():
+        if at_ns[place] >= NEVER_NS:
+            return
+        yield from ((cycle, place) for cycle in range(since, int(newest[place]), every))
+        since = max(since, int(newest[place]))
 
 
 def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Floats:

@@ -132,6 +132,7 @@ class WatchedCell:
 
     def _window_state(self, window: Mapping[str, Any]) -> Plain:
         seen = {name: window[name] for name in ("l95_ms", "violation_rate", "cost")}
+        seen["age_ms"] = window.get("mean_age_ms")
         last, period_s = window["last_cycle"], self.problem.pipeline.period_ms / 1e3
         recent = self._windows[-3:]
         before = [one for one in recent if one.said["last_cycle"] < last][-1:]

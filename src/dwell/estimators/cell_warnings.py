@@ -7,7 +7,8 @@ and of the simulations for prices. Each warning names the setting and a remedy.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations
 from typing import NamedTuple
@@ -421,30 +422,63 @@ def _false_alarms(problem: Problem, profile: Profile) -> Iterator[Fault]:
 
     The guard fires when the cycle after the newest completed cycle is older than its patience,
     max(D, P) + (g - 1) P. It also fires under a fallback, except just after it has moved the cell
-    there.
+    there. For a chain with a `max_age_ms`, it fires when the newest origin is too old; its age
+    grows until the run of the last task after the oldest actuation.
     """
-    settings = problem.controller
-    # With a chain in place of the latency, the profile does not have L95 of cycles.
-    if not settings.fallbacks or problem.objective.latency is not None:
+    settings, pipeline = problem.controller, problem.pipeline
+    if not settings.fallbacks:
         return
-    bound_ms = (problem.guard_patience_ns - problem.pipeline.period_ns) / 1e6
-    for name, l95_ms in profile.l95_ms.items():
-        needed_ms = l95_ms + _return_ms(problem, name)
-        elsewhere = any(fallback != name for fallback in settings.fallbacks)
-        if elsewhere and needed_ms > bound_ms:
+    bound_ms = (problem.guard_patience_ns - pipeline.period_ns) / 1e6
+    for name, needed_ms in _tight(problem, profile, None, pipeline.sinks, bound_ms):
+        yield Fault(
+            "controller.guard_cycles",
+            f"{settings.guard_cycles} is tight for {name}: L95 and the way back to the source "
+            f"take {needed_ms:.1f} ms, more than {bound_ms:.1f} ms, the guard's patience less "
+            "one period: the guard fires without a fault; raise it",
+        )
+    for chain_name, (patience_ns, _) in problem.chain_patiences.items():
+        one = pipeline.chains[chain_name]
+        bound_ms = (patience_ns - pipeline.rates[one.target] * pipeline.period_ns) / 1e6
+        for name, needed_ms in _tight(problem, profile, chain_name, [one.target], bound_ms):
             yield Fault(
-                "controller.guard_cycles",
-                f"{settings.guard_cycles} is tight for {name}: L95 and the way back to the source "
-                f"take {needed_ms:.1f} ms, more than {bound_ms:.1f} ms, the guard's patience less "
-                "one period: the guard fires without a fault; raise it",
+                f"chains.{chain_name}.max_age_ms",
+                f"{one.max_age_ms:g} is tight for {name}: L95 of the age and the way back to the "
+                f"source take {needed_ms:.1f} ms, more than {bound_ms:.1f} ms, the guard's "
+                f"patience less the time between two runs of {one.target}: the guard fires "
+                "without a fault; raise it, or controller.guard_cycles",
             )
 
 
-def _return_ms(problem: Problem, candidate: str) -> float:
-    """Return the longest mean delay of the links from a sink's node to a source's node, ms."""
+def _tight(
+    problem: Problem, profile: Profile, latency: str | None, ends: Iterable[str], bound_ms: float
+) -> Iterator[tuple[str, float]]:
+    """Yield candidates whose L95 and way back take longer than the guard waits, and that time.
+
+    `latency` is the chain whose data age counts in L95, or None for the latency of cycles.
+    """
+    for name, l95_ms in _l95_ms(problem, profile, latency).items():
+        needed_ms = l95_ms + _return_ms(problem, name, ends)
+        elsewhere = any(fallback != name for fallback in problem.controller.fallbacks)
+        if elsewhere and needed_ms > bound_ms:
+            yield name, needed_ms
+
+
+def _l95_ms(problem: Problem, profile: Profile, latency: str | None) -> Mapping[str, float]:
+    """Return L95 of each candidate undisturbed: of a chain's age, or of cycles."""
+    if latency != problem.objective.latency:
+        # Any chain is frequent enough for decisions once per window.
+        controller = replace(problem.controller, decide_cycles=problem.window_cycles)
+        objective = replace(problem.objective, latency=latency)
+        profile = Profile(replace(problem, objective=objective, controller=controller))
+    # The bound on an age in J may be below the guard's patience for the chain.
+    return profile.l95_ms if latency is None else profile.uncut_l95_ms
+
+
+def _return_ms(problem: Problem, candidate: str, ends: Iterable[str]) -> float:
+    """Return the longest mean delay of the links from some tasks' nodes to a source's node, ms."""
     pipeline, placement = problem.pipeline, problem.candidates[candidate].first
     sources = [placement[task] for task in pipeline.tasks if not pipeline.inputs(task)]
-    sinks = [placement[task] for task in pipeline.tasks if not pipeline.outputs(task)]
+    sinks = [placement[task] for task in ends]
     names = [f"{sink}->{source}" for sink in sinks for source in sources]
     links = problem.fabric.links
     return max((links[name].delay_ms.expectation for name in names if name in links), default=0.0)

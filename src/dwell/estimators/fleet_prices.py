@@ -19,7 +19,8 @@ from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.cell_terms import CellTerms
 from dwell.estimators.present import AS_DECLARED, Present
 from dwell.estimators.prices import SEED
-from dwell.kernels.arrays import Arrays
+from dwell.kernels.arrays import Arrays, CellArrays
+from dwell.kernels.over_age import due_misses
 from dwell.kernels.random_draws import draw
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats
@@ -27,6 +28,7 @@ from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 from dwell.model.scenario import Scenario
+from dwell.model.stretches import share_over
 
 #: Candidate of each cell, in their order; None for a cell that is left out.
 Placements: TypeAlias = tuple[str | None, ...]
@@ -222,9 +224,18 @@ class FleetPrices:
         shares = self._used(arrays, i).items()
         used = FrozenDict((name, share) for name, share in shares if name not in terms.of_shared)
         age_ms, per_hour = float(played.age_ms.mean()), float(played.price_per_hour.mean())
-        known = l95_ms, rate, used, max(uncut_ms, l95_ms)
-        qos = QoS(*known, age_ms=age_ms, price_per_hour=per_hour)
+        known, misses = (l95_ms, rate, used, max(uncut_ms, l95_ms)), self._misses(arrays, i)
+        qos = QoS(*known, age_ms=age_ms, misses=misses, price_per_hour=per_hour)
         return CellPrice(qos, terms.cost(qos), windows)
+
+    def _misses(self, arrays: Arrays, i: int) -> float | None:
+        """Return the share of a cell's stretches with more misses than its cap, if it has one."""
+        problem, realisation = self._player.cells[i]
+        cap, width = problem.objective.caps.misses, problem.window_cycles
+        if cap is None:
+            return None
+        played = problem.pipeline, realisation.release_ns, CellArrays(arrays, i)
+        return share_over(due_misses(*played, slice(width, self._windows[i] * width)), cap)
 
     def _used(self, arrays: Arrays, i: int) -> dict[str, float]:
         """Return the utilisation of each resource by all cells, averaged over a cell's windows."""
@@ -234,7 +245,10 @@ class FleetPrices:
 
 def _windows_of(problem: Problem, cells: Sequence[PricedCell], cycles: int) -> int:
     """Return the number of simulated windows of a cell, for about the same time in all cells."""
-    periods_ms = [cell.problem.pipeline.period_ms for cell in cells]
-    span_ms = cycles / sum(1 / period_ms for period_ms in periods_ms)
+    pipelines = [(cell.problem.pipeline, cell.problem.objective.caps.misses) for cell in cells]
+    span_ms = cycles / sum(1 / pipeline.period_ms for pipeline, _ in pipelines)
+    # Caps on misses need enough stretches, at the same load of all cells.
+    capped = [cap.least_cycles * of.due_interval * of.period_ms for of, cap in pipelines if cap]
+    span_ms = max(span_ms, *capped, 0.0)
     window_ms = problem.window_ms
     return 1 + max(math.ceil(span_ms / window_ms), FEWEST - 1)

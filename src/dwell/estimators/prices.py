@@ -29,8 +29,9 @@ from dwell.estimators.sent_shadows import SentShadows, hindered
 from dwell.estimators.slow_processes import mean_and_error, slow_processes, unseen_error
 from dwell.kernels.arrays import Arrays, CellArrays
 from dwell.kernels.codes import CycleOutcome
-from dwell.kernels.over_age import over_age
+from dwell.kernels.over_age import due_misses
 from dwell.kernels.random_draws import Drawing
+from dwell.kernels.realisation import Realisation
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.instants import NEVER_NS, longest_run
@@ -219,7 +220,9 @@ def _answer(question: Question) -> Mapping[str, Price]:
     loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
     least_cycles = slow.least_cycles(problem.pipeline.period_ms)
     if question.misses is not None:
-        least_cycles = max(least_cycles, question.misses.least_cycles)
+        least_cycles = max(
+            least_cycles, question.misses.least_cycles * problem.pipeline.due_interval
+        )
     least = SETTLING + math.ceil(least_cycles / problem.window_cycles)
     windows = min(_first_windows(problem, question.scenario), most)
     if question.misses is not None:
@@ -304,18 +307,10 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         )
     since = first * problem.window_cycles
     latency_ns, outcome = tables.latency_ns[0, since:], tables.outcome[0, since:]
-    done, is_idle = outcome == CycleOutcome.DONE, outcome == CycleOutcome.IDLE
+    done = outcome == CycleOutcome.DONE
     cap = problem.objective.caps.misses
     finished_ms = latency_ns[done] / 1e6
-    usual_ms = float(np.median(finished_ms)) if len(finished_ms) else 0.0
-    # A cycle that is unfinished and no older than usual may complete or not: it is left out.
-    age_ms = (realisation.release_ns[-1] - realisation.release_ns[since:-1]) / 1e6
-    is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
-    lost = int(np.count_nonzero(~done & ~is_young & ~is_idle))
-    uncut_ms, is_lost = _known_later(latency_ns, is_idle, windows_ms)
-    open_windows = is_young.reshape(len(rates), -1).any(axis=1)
-    if not open_windows.all():
-        uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
+    uncut_l95_ms, lost_windows = _uncut(problem, realisation, windows, latency_ns, outcome)
     own, foreign = windows.shares[:, 1], _foreign(windows.shares)
     stretches = foreign
     if len(looks := tables.look_shares[0, since // problem.decide_cycles :, 0]):
@@ -324,9 +319,7 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
     return Price(
         l95_ms=l95_ms,
         l95_error_ms=l95_error_ms,
-        uncut_l95_ms=math.inf
-        if lost > 0.05 * np.count_nonzero(~is_idle)
-        else max(float(uncut_ms.mean()), l95_ms),
+        uncut_l95_ms=max(uncut_l95_ms, l95_ms),
         violation_rate=violation_rate,
         violation_error=violation_error,
         latency_ms=float(finished_ms.mean()) if len(finished_ms) else math.nan,
@@ -334,7 +327,7 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         foreign=by_resource(foreign.mean(axis=0)),
         foreign_deviation=by_resource(stretches.std(axis=0)),
         cycles=realisation.cycles,
-        lost_windows=float(is_lost.mean()),
+        lost_windows=lost_windows,
         is_settled=bool(slow.loops)
         or slow.is_timed
         or (_is_settled(windows_ms, l95_error_ms) and _is_settled(rates, violation_error)),
@@ -342,17 +335,44 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
         violation_deviation=_deviation(rates, violation_error),
         age=_age(player, name, windows, is_last=is_last) if problem.objective.weighs_age else None,
         price_per_hour=float(windows.price_per_hour.mean()) if problem.fabric.has_prices else None,
-        misses=None if cap is None else share_over(_missed(player, arrays, since)[~is_idle], cap),
+        misses=None if cap is None else share_over(_missed(player, arrays, since), cap),
     )
 
 
+def _uncut(
+    problem: Problem,
+    realisation: Realisation,
+    windows: PlayedWindows,
+    latency_ns: Ints,
+    outcome: NDArray[np.int8],
+) -> tuple[float, float]:
+    """Return L95 without the bound for J, ms, and the share of the windows whose L95 is lost.
+
+    The L95 is infinite if over 5 % of the cycles are lost; of ages, if over 5 % of the windows are.
+    """
+    if problem.objective.latency is not None:
+        is_lost = np.isinf(windows.uncut_ms)
+        share = float(is_lost.mean())
+        return math.inf if share > 0.05 else float(windows.uncut_ms[~is_lost].mean()), share
+    done, is_idle = outcome == CycleOutcome.DONE, outcome == CycleOutcome.IDLE
+    usual_ms = float(np.median(latency_ns[done] / 1e6)) if done.any() else 0.0
+    # A cycle that is unfinished and no older than usual may complete or not: it is left out.
+    age_ms = (realisation.release_ns[-1] - realisation.release_ns[-1 - len(outcome) : -1]) / 1e6
+    is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
+    lost = int(np.count_nonzero(~done & ~is_young & ~is_idle))
+    uncut_ms, is_lost = _known_later(latency_ns, is_idle, windows.l95_ms)
+    open_windows = is_young.reshape(len(uncut_ms), -1).any(axis=1)
+    if not open_windows.all():
+        uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
+    over = lost > 0.05 * np.count_nonzero(~is_idle)
+    return math.inf if over else float(uncut_ms.mean()), float(is_lost.mean())
+
+
 def _missed(player: CandidatePlayer, arrays: Arrays, since: int) -> NDArray[np.bool_]:
-    """Return whether each cycle from `since` on is late, or its data are too old."""
+    """Return whether each cycle with a due sink, from `since` on, has missed."""
     ((problem, realisation),) = player.cells
-    late = arrays.tables.latency_ns[0, since:] > problem.pipeline.deadline_ns
     played = problem.pipeline, realisation.release_ns, CellArrays(arrays)
-    missed: NDArray[np.bool_] = late | over_age(*played, slice(since, realisation.cycles))
-    return missed
+    return due_misses(*played, slice(since, realisation.cycles))
 
 
 def _age(

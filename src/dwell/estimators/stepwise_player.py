@@ -20,8 +20,7 @@ from dwell.estimators.prices import SEED, prices_of
 from dwell.estimators.slow_processes import unseen_error
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, CellArrays
-from dwell.kernels.codes import CycleOutcome
-from dwell.kernels.over_age import over_age
+from dwell.kernels.over_age import due_misses
 from dwell.kernels.sampling_errors import PAIRS, SeriesSums, Steps, tail_error_ms
 from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
@@ -116,7 +115,8 @@ class StepwisePlayer:
         #: Least number of steps with enough stretches for the cap on misses.
         self._least = 0
         if misses is not None:
-            self._least = 1 + -(-misses.least_cycles // (self._step * self._window))
+            least_cycles = misses.least_cycles * problem.pipeline.due_interval
+            self._least = 1 + -(-least_cycles // (self._step * self._window))
         self._kept = max(KEPT, self._least)
         self._player = CandidatePlayer(
             [(played, self.declared.realisation)],
@@ -198,10 +198,9 @@ class StepwisePlayer:
             )
             cycles, tables = slice(first * self._window, twin.cursor), twin.arrays.tables
             latency_ns = tables.latency_ns[0, cycles].copy()
-            due = tables.outcome[0, cycles] != CycleOutcome.IDLE
             played = self._pipeline, self.declared.realisation.release_ns, CellArrays(twin.arrays)
-            missed = (latency_ns > self._pipeline.deadline_ns) | over_age(*played, cycles)
-            twin.add(means, terms, latency_ns, missed[due], self._offset + twin.cursor)
+            missed = due_misses(*played, cycles)
+            twin.add(means, terms, latency_ns, missed, self._offset + twin.cursor)
         twin.price = None
         self.cycles += self._step * self._window
 

@@ -116,6 +116,8 @@ template <class S>
     if (kind == kDecide) {
       // A move has postponed this decision; its event is invalid.
       if (cycle_of(event.key) != s.cell(cell).look_cycle) continue;
+      // The last window has closed: a decision would have no effect.
+      if (!s.cell(cell).close_pending && !s.cell(cell).migrating && !plays_on) continue;
       const i64 index = s.cell(cell).look;
       look(s, cell, now);
       if (pauses_at(s, index)) return kPaused;

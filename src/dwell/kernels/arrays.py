@@ -217,7 +217,7 @@ class Arrays:
 #: Tables with rows by cell.
 BY_CELL = (
     *("cells", "stamps", "latency_ns", "compute_ns", "network_ns", "outcome", "late_copies"),
-    *("paid", "actuated_ns", "actuated_from"),
+    *("paid", "actuated_ns", "actuated_from", "actuated_newest"),
     *("opened", "closed", "seen", "shares"),
     *("look_opened", "look_closed", "looked", "look_shares"),
 )
@@ -868,8 +868,8 @@ class _Layout:
             "attempts": (cells * slots, max(self.max_flows, 1)),
             "own_ns": (cells, self.max_resources),
             "ages": max(problem.window_cycles for problem, _ in self.cells),
-            "origins": (cells, cycles, self.max_tasks, chains),
-            "actuated_from": (cells, chains, cycles),
+            "descents": (cells, cycles, self.max_tasks, chains),
+            **dict.fromkeys(("actuated_from", "actuated_newest"), (cells, chains, cycles)),
             "shadow_bytes": (cells if self.shadows else 0, cycles),
             "log_outcome": logged * self.max_tasks,
             "paid": (cells * any(problem.fabric.has_prices for problem, _ in self.cells), cycles),

@@ -7,26 +7,29 @@
 
 namespace dwell {
 
-// Origin of a job that descends from no cycle of a chain's first task.
+// Descent of a job from no cycle of a chain's first task.
 constexpr i32 kNoOrigin = std::numeric_limits<i32>::max();
+constexpr Descent kNoDescent{kNoOrigin, -1};
 
-// Finds the oldest cycle from which a job descends, per chain, when a worker takes the job.
+// Finds the cycles from which a job descends, per chain, when a worker takes the job.
 template <class S>
 void descend(S& s, i64 key) {
   const i64 cell = cell_of(key), cycle = cycle_of(key), task = item_of(key);
   const Cell& of = s.cell(cell);
   for (i64 chain = 0; chain < of.n_chains; ++chain) {
-    i32& origin = s.origin(cell, cycle, task, chain);
+    Descent& descent = s.descent(cell, cycle, task, chain);
     if (s.chains[of.chain_0 + chain].source == task) {
-      origin = static_cast<i32>(cycle);
+      descent = {static_cast<i32>(cycle), static_cast<i32>(cycle)};
       continue;
     }
-    origin = kNoOrigin;
+    descent = kNoDescent;
     for (i64 flow = 0; flow < of.n_flows; ++flow) {
       const Flow& ends = s.flow(cell, flow);
       if (ends.target != task) continue;
       const i64 from = ends.is_sampled ? value_of(s, s.job(key).site, flow) : cycle;
-      if (from != kNoValue) origin = std::min(origin, s.origin(cell, from, ends.source, chain));
+      if (from == kNoValue) continue;
+      const Descent& sent = s.descent(cell, from, ends.source, chain);
+      descent = {std::min(descent.oldest, sent.oldest), std::max(descent.newest, sent.newest)};
     }
   }
 }
@@ -38,10 +41,12 @@ void actuate(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   for (i64 number = 0; number < of.n_chains; ++number) {
     Chain& chain = s.chains[of.chain_0 + number];
     if (chain.target != task) continue;
-    const i32 origin = s.origin(cell, cycle, task, number);
-    if (origin != kNoOrigin) chain.last = origin;
-    s.actuated_ns[s.actuation(cell, number, cycle)] = now;
-    s.actuated_from[s.actuation(cell, number, cycle)] = chain.last;
+    const Descent& descent = s.descent(cell, cycle, task, number);
+    if (descent.oldest != kNoOrigin) chain.last = descent.oldest;
+    const i64 row = s.actuation(cell, number, cycle);
+    s.actuated_ns[row] = now;
+    s.actuated_from[row] = chain.last;
+    s.actuated_newest[row] = descent.newest;
   }
 }
 

@@ -1,4 +1,4 @@
-"""Cycles that miss because the data of their actuations are too old."""
+"""Cycles that miss, also because the data of their actuations are too old."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.arrays import CellArrays
+from dwell.kernels.codes import CycleOutcome
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Ints
 from dwell.model.pipeline import Pipeline
@@ -36,3 +37,14 @@ def over_age(
             age_ns = at_ns - release_ns[arrays.tables.actuated_from[0, number, cycles]]
             over |= (at_ns <= by_ns) & (age_ns > chain.max_age_ns)
     return over
+
+
+def due_misses(
+    pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice
+) -> NDArray[np.bool_]:
+    """Return whether each cycle is late or its data are too old, without idle cycles."""
+    tables = arrays.tables
+    missed = tables.latency_ns[0, cycles] > pipeline.deadline_ns
+    missed |= over_age(pipeline, release_ns, arrays, cycles)
+    due: NDArray[np.bool_] = missed[tables.outcome[0, cycles] != CycleOutcome.IDLE]
+    return due

@@ -90,6 +90,9 @@ struct Crossing;  // of meter.cpp
   field(f64, paid) /* price of all transmissions of the cell and its shadow so far */            \
   field(i32, shadow) field(i32, parent)
 
+// Cycles of a chain's first task from which a job descends.
+#define DWELL_DESCENT(field) field(i32, oldest) field(i32, newest)
+
 // A chain of tasks; `last` is the origin of its last actuation. An older age than `max_age_ns` is a
 // miss.
 #define DWELL_CHAIN(field)                                                                       \
@@ -345,7 +348,8 @@ struct Crossing;  // of meter.cpp
   row(Site, DWELL_SITE) row(Server, DWELL_SERVER) row(Quota, DWELL_QUOTA)                        \
   row(Node, DWELL_NODE) row(Change, DWELL_CHANGE) row(Hop, DWELL_HOP)                            \
   row(Link, DWELL_LINK) row(Held, DWELL_HELD)                                                    \
-  row(Forward, DWELL_FORWARD) row(Repeat, DWELL_REPEAT) row(Chain, DWELL_CHAIN)                  \
+  row(Forward, DWELL_FORWARD) row(Repeat, DWELL_REPEAT) row(Descent, DWELL_DESCENT)              \
+  row(Chain, DWELL_CHAIN)                                                                        \
   row(Segment, DWELL_SEGMENT) row(Rate, DWELL_RATE)                                              \
   row(Event, DWELL_EVENT) row(Running, DWELL_RUNNING) row(Waiting, DWELL_WAITING)                \
   row(Job, DWELL_JOB) row(Slot, DWELL_SLOT) row(Log, DWELL_LOG) row(Seen, DWELL_SEEN)            \
@@ -384,11 +388,11 @@ DWELL_ROWS(DWELL_STRUCT)
   table(Running, running) table(Waiting, waiting)                                                \
   table(i32, dirty) table(i64, ready) table(Job, jobs) table(Slot, slots) table(i64, attempts)   \
   table(f64, own_ns) table(i64, soonest_ns) table(i64, ages) table(i64, values)                  \
-  table(i64, forwarded) table(Chain, chains) table(i32, origins)                                 \
+  table(i64, forwarded) table(Chain, chains) table(Descent, descents)                            \
   table(Rule, rule) table(Option, options) table(f64, shown)                                     \
   table(i64, latency_ns) table(i64, compute_ns) table(i64, network_ns) table(i8, outcome)        \
   table(i64, late_copies) table(f64, paid)                                                       \
-  table(i64, actuated_ns) table(i64, actuated_from)                                              \
+  table(i64, actuated_ns) table(i64, actuated_from) table(i64, actuated_newest)                  \
   table(f64, opened) table(f64, closed) table(Seen, seen) table(f64, shares)                     \
   table(f64, look_opened) table(f64, look_closed) table(Seen, looked) table(f64, look_shares)    \
   table(Decided, decided) table(f64, priced)                                                     \

@@ -137,7 +137,7 @@ class Tables(NamedTuple):
     values: Ints  # (sites, flows) cycle of the newest message of a sampled input; -1 for none
     forwarded: Ints  # (forwards,) newest cycle that was forwarded; -1 for none
     chains: Rows  # chains of all cells
-    origins: NDArray[np.int32]  # (cells, N, tasks, chains) oldest cycle that a job descends from
+    descents: Rows  # (cells, N, tasks, chains) oldest and newest cycle that a job descends from
     rule: Rows  # (1,), or empty if Python decides
     options: Rows  # (candidates,)
     shown: Floats  # (resources, candidates) last share under a candidate, kept while full; else 1
@@ -150,6 +150,7 @@ class Tables(NamedTuple):
     paid: Floats  # (cells, N) price of all transmissions up to the release; or empty
     actuated_ns: Ints  # (cells, chains, N) completion of a chain's last task, or NEVER_NS
     actuated_from: Ints  # (cells, chains, N) the origin of this actuation
+    actuated_newest: Ints  # (cells, chains, N) newest cycle that it descends from, -1 for none
     opened: Floats  # (cells, windows, PARTS, resources) at first releases
     closed: Floats  # (cells, windows, PARTS, resources) at the end of windows
     seen: Rows  # (cells, windows) metrics as known at the end of windows

@@ -59,9 +59,9 @@ struct Simulation : Tables {
   i64 output(i64 cell, i64 cycle) const { return (kPlain ? 0 : cell * n_cycles) + cycle; }
   i16& stamp(i64 cell, i64 cycle) const { return stamps[output(cell, cycle)]; }
 
-  // Oldest cycle of a chain's first task from which a job descends.
-  i32& origin(i64 cell, i64 cycle, i64 task, i64 chain) const {
-    return origins[(output(cell, cycle) * n_tasks + task) * clock[0].n_chains + chain];
+  // Cycles of a chain's first task from which a job descends.
+  Descent& descent(i64 cell, i64 cycle, i64 task, i64 chain) const {
+    return descents[(output(cell, cycle) * n_tasks + task) * clock[0].n_chains + chain];
   }
 
   // Place of a cycle in the actuations of a chain.

@@ -60,7 +60,11 @@ class Weights:
 class Targets:
     """Design targets that normalise latency and utilisation (paper, eq. 5)."""
 
-    latency_ms: float = key("Of L95, ms.", TARGET, usual="the deadline")
+    latency_ms: float = key(
+        "Of L95, ms.",
+        TARGET,
+        usual="the deadline; `max_age_ms` of the chain `objective.latency`, if it has one",
+    )
     robot: float = key("Of robot utilisation.", TARGET, default=0.7)
     edge: float = key("Of edge utilisation.", TARGET, default=0.7)
     cloud: float | None = key(

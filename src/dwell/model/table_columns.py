@@ -113,9 +113,14 @@ UNACTUATED = "the chain did not actuate in the cycle"
 UNASKED = "the ledger was not asked"
 
 #: Columns of a study's tables with names in them: share of the windows that began under a
-#: candidate, mean utilisation of a resource, L95 of a chain's data age, and share over its bound.
+#: candidate, mean utilisation of a resource.
 SHARE_OF, USE_OF = "share_{candidate}", "node_{resource}"
-AGE_OF, OVER_AGE_OF = "age_l95_{chain}", "age_missed_{chain}"
+#: Columns of chains: L95 of the data age, share over its bound, and L95 of the reaction time.
+OF_CHAINS = AGE_OF, OVER_AGE_OF, REACTION_OF = (
+    "age_l95_{chain}",
+    "age_missed_{chain}",
+    "reaction_l95_{chain}",
+)
 
 CYCLES = (
     Column("cycle", "Int64", "Number of the cycle, from 0 without gaps."),
@@ -197,7 +202,7 @@ WINDOWS = (
         "seen_price_per_hour",
         "Float64",
         "Price of the bytes that links transmitted up to the close, money per hour.",
-        null=UNSEEN,
+        null=f"{UNSEEN}, or a live cell",
         of=PRICE,
     ),
     Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),
@@ -211,6 +216,12 @@ WINDOWS = (
         OVER_AGE_OF,
         "Float64",
         "Share of these actuations whose age is over `max_age_ms`; 1 without any.",
+    ),
+    Column(
+        REACTION_OF,
+        "Float64",
+        "L95 of the reaction times of a chain that end at these actuations; infinite without any.",
+        "ms",
     ),
     Column("overtaken", "Int64", "Its cycles that completed after a later cycle.", is_new=True),
     Column(
@@ -424,7 +435,7 @@ ENDS = ("", "_low", "_high")
 #: Names of the columns by table.
 TEMPLATES: Mapping[str, Sequence[str]] = {
     **{name: [column.name for column in table.columns] for name, table in TABLES.items()},
-    "runs": [of + end for of in (SHARE_OF, USE_OF, AGE_OF, OVER_AGE_OF) for end in ENDS],
+    "runs": [of + end for of in (SHARE_OF, USE_OF, *OF_CHAINS) for end in ENDS],
 }
 
 

@@ -1,14 +1,14 @@
-"""Data ages of chains in windows."""
+"""Data ages and reaction times of chains in windows."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dwell.control import NO_AGE
+from dwell.control import NO_AGE, final_l95_ms, reactions
 from dwell.kernels.arrays import CellArrays
 from dwell.kernels.realisation import Realisation
 from dwell.model.instants import NEVER_NS
-from dwell.model.number_arrays import Ints
+from dwell.model.number_arrays import Floats, Ints
 
 
 def chain_ages_ns(realisation: Realisation, arrays: CellArrays, number: int) -> Ints:
@@ -19,3 +19,25 @@ def chain_ages_ns(realisation: Realisation, arrays: CellArrays, number: int) -> 
     tables, cycles = arrays.tables, slice(realisation.cycles)
     at_ns, origin = tables.actuated_ns[0, number, cycles], tables.actuated_from[0, number, cycles]
     return np.where(at_ns < NEVER_NS, at_ns - realisation.release_ns[origin], NO_AGE)
+
+
+def reaction_l95_ms(
+    realisation: Realisation, arrays: CellArrays, number: int, every: int, firsts: Ints, width: int
+) -> Floats:
+    """Return L95 of the reaction times of a chain that end in each window; infinite without any.
+
+    Parameters
+    ----------
+    number, every : int
+        Number of the chain, and cycles from one release of its first task to the next.
+    firsts : int64 array, shape (windows,)
+        First cycle of each window of `width` cycles.
+    """
+    tables, cycles = arrays.tables, slice(realisation.cycles)
+    at_ns, newest = (
+        table[0, number, cycles] for table in (tables.actuated_ns, tables.actuated_newest)
+    )
+    found = np.array([*reactions(at_ns, newest, every, 0)], np.int64).reshape(-1, 2)
+    after_ns = at_ns[found[:, 1]] - realisation.release_ns[found[:, 0]]
+    inside = [(found[:, 1] >= first) & (found[:, 1] < first + width) for first in firsts.tolist()]
+    return np.array([final_l95_ms(after_ns[one]) if one.any() else np.inf for one in inside])

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from dwell.errors import SimulationError
 from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, CellArrays, lay_out
-from dwell.kernels.codes import CycleOutcome
-from dwell.kernels.over_age import over_age
+from dwell.kernels.over_age import due_misses
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model import Problem
@@ -147,10 +146,8 @@ def _result(
         width, closed = problem.window_cycles, int(tables.cells["window"][row])
         first, last = problem.warmup_windows, closed
         cycles = slice(first * width, last * width)
-        is_due = tables.outcome[row, cycles] != CycleOutcome.IDLE
-        late = tables.latency_ns[row, cycles] > problem.pipeline.deadline_ns
-        late |= over_age(problem.pipeline, cell.real.release_ns, CellArrays(arrays, row), cycles)
-        missed.append(late[is_due])
+        of_cell = problem.pipeline, cell.real.release_ns, CellArrays(arrays, row)
+        missed.append(due_misses(*of_cell, cycles))
         if not used:
             shares = tables.shares[row, first:last, 0].mean(axis=0).tolist()
             resources = problem.fabric.resources.values()

@@ -31,7 +31,7 @@ from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.window_close import window_close_ns
 from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
-from dwell.sim.chain_ages import chain_ages_ns
+from dwell.sim.chain_ages import chain_ages_ns, reaction_l95_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -321,13 +321,18 @@ def _final_l95_ms(played: PlayedRealisation) -> Floats:
 
 
 def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:
-    """Return the L95 of each chain's data age, and the share over its bound."""
+    """Return the L95 of each chain's data age, the share over its bound, and L95 of reactions."""
+    pipeline, width = played.problem.pipeline, played.problem.window_cycles
     columns: dict[str, Callable[[], NDArray[np.generic]]] = {}
-    for number, (name, chain) in enumerate(played.problem.pipeline.chains.items()):
+    for number, (name, chain) in enumerate(pipeline.chains.items()):
         ages_ns = cache(partial(_ages_ns, played, number))
         columns[f"age_l95_{name}"] = partial(_on_ages, ages_ns, age_l95_ms)
         over = partial(age_missed, max_age_ns=chain.max_age_ns)
         columns[f"age_missed_{name}"] = partial(_on_ages, ages_ns, over)
+        of_chain = number, pipeline.rates[chain.source], played.first, width
+        columns[f"reaction_l95_{name}"] = partial(
+            reaction_l95_ms, played.realisation, played.arrays, *of_chain
+        )
     return columns
 
 

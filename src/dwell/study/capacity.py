@@ -45,8 +45,8 @@ USELESS = 0.5
 ROUNDING = 1e-12
 #: Half-width of a 95 % interval in standard errors.
 NORMAL = 1.96
-#: Sizes simulated together if no cell moves: their cells are sampled once.
-TOGETHER = 8
+#: Fewest and most sizes simulated together if no cell moves: their cells are sampled once.
+FEWEST_TOGETHER, MOST_TOGETHER = 8, 32
 #: Number of seeds for the waiting times of missed cycles.
 WAITING_SEEDS = 3
 
@@ -482,12 +482,7 @@ class _Search:
             self._tell(done)
             return True
 
-        steps = range(1, self.most + 1, TOGETHER)
-        units = [
-            Sizes(first, min(first + TOGETHER - 1, self.most), seed)
-            for first in steps
-            for seed in seeds
-        ]
+        units = [Sizes(*ends, seed) for ends in _together(self.most) for seed in seeds]
         self._spread(units, take)
         for size in [one for one in sizes.played if one > done]:
             del sizes.played[size]
@@ -548,6 +543,15 @@ class _Search:
     def _tell(self, done: int) -> None:
         if self.progress is not None:
             self.progress(done, self.most)
+
+
+def _together(most: int) -> Iterator[tuple[int, int]]:
+    """Yield ranges of sizes up to `most`; each at most doubles the largest size."""
+    first = 1
+    while first <= most:
+        count = min(max(first - 1, FEWEST_TOGETHER), MOST_TOGETHER, most + 1 - first)
+        yield first, first + count - 1
+        first += count
 
 
 def _with_short_warmup(fleet: Fleet) -> Fleet:

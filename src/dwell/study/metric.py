@@ -10,7 +10,14 @@ from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
 from dwell.display import Measure
-from dwell.model.table_columns import AGE_OF, OVER_AGE_OF, SHARE_OF, USE_OF
+from dwell.model.table_columns import (
+    AGE_OF,
+    OF_CHAINS,
+    OVER_AGE_OF,
+    REACTION_OF,
+    SHARE_OF,
+    USE_OF,
+)
 
 Better: TypeAlias = Literal["lower", "higher", ""]
 #: Values of a column, which determine its interval over seeds: `median` if they may be infinite,
@@ -43,7 +50,7 @@ class Metric(Measure):
 
 
 #: Columns with the name of a placement, a resource or a chain in them.
-NAMED = (SHARE_OF, USE_OF, AGE_OF, OVER_AGE_OF)
+NAMED = (SHARE_OF, USE_OF, *OF_CHAINS)
 #: All metrics by column; those of `NAMED` have one column per name.
 METRICS: Mapping[str, Metric] = {
     metric.column: metric
@@ -58,6 +65,11 @@ METRICS: Mapping[str, Metric] = {
         Metric("cost", "J", decimals=2, wording="mean of windows", values="positive"),
         Metric(AGE_OF, "age of {chain}", "ms", wording="L95, mean of windows", values="median"),
         Metric(OVER_AGE_OF, "{chain} too old", "%", 100.0, wording="actuations", values="share"),
+        Metric(
+            *(REACTION_OF, "reaction of {chain}", "ms"),
+            wording="L95, mean of windows",
+            values="median",
+        ),
         Metric("seen_age_ms", "age in J", "ms", wording="mean of windows", values="positive"),
         Metric("seen_price_per_hour", "price of bytes", "/h", decimals=4, values="positive"),
         Metric("nodes_price_per_hour", "price of nodes", "/h", decimals=4, values="positive"),
@@ -103,7 +115,7 @@ METRICS: Mapping[str, Metric] = {
 
 def further_columns(chains: Iterable[str]) -> list[str]:
     """Return the columns of ages and prices, which only some cells have."""
-    ages = [of.format(chain=name) for name in chains for of in (AGE_OF, OVER_AGE_OF)]
+    ages = [of.format(chain=name) for name in chains for of in OF_CHAINS]
     return [*ages, "seen_age_ms", "seen_price_per_hour", "nodes_price_per_hour"]
 
 

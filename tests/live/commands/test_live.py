@@ -19,7 +19,6 @@ from dwell.errors import LiveError
 from dwell.live.commands import live
 from dwell.live.host.operator_client import OperatorClient
 from dwell.live.wire.wiring import roles
-from dwell_lab.chaos.disk import SmallDisk, may_mount
 from tests.cli.live_cell import EXAMPLE, MOODY, RealCell, in_window, invoke
 from tests.cli.small_cell import ROOT
 from tests.waiting import PATIENCE_S
@@ -255,32 +254,6 @@ def test_the_run_is_a_run(cell: RealCell) -> None:
     run = dwell.open_run(folder)
     assert run.windows.height > 5
     assert {"LOC", "SO"} <= set(run.windows["placement"])
-
-
-@pytest.mark.skipif(not may_mount(), reason="nobody but root mounts a disk")
-def test_a_run_folder_that_is_full_from_the_start_keeps_nobody_from_deciding(
-    tmp_path: Path,
-) -> None:
-    made = RealCell(tmp_path)
-    with SmallDisk(tmp_path / "runs") as disk:
-        disk.fill()
-        try:
-            made.begin()
-            assert invoke("live", "pin", "SO", "--cell", made.file)[0] == 0
-            status = made.until(lambda status: in_window("SO")(status) and status["record"])
-            assert "No space left on device" in status["record"]
-            made.show(lambda stdout: "No space left on device" in stdout)
-            assert "No space left on device" in (tmp_path / "controller.log").read_text()
-            disk.clear()
-            status = made.until(lambda status: status["record"] is None)
-            assert made.end("controller") == 0
-        finally:
-            made.close()
-        (folder,) = disk.folder.iterdir()
-        run = dwell.open_run(folder)
-        assert run.meta["recovered"]["missing_windows"] == 0
-        assert run.windows.height >= status["windows"]
-        assert {"LOC", "SO"} <= set(run.windows["placement"])
 
 
 def test_nobody_answers(tmp_path: Path) -> None:

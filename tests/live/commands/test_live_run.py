@@ -33,6 +33,8 @@ from tests.processes import lives
 from tests.report.live_runs import PERIOD_NS, live_run
 
 CELL = ROOT / "examples" / "visual_servoing" / "cell.yaml"
+#: Its stages are light: less of the machine is needed to start and end it.
+LIGHT = ROOT / "examples" / "live" / "cell.yaml"
 #: Far more than any of it takes, on a machine that has a lot else to do.
 PATIENCE_S = 240.0
 #: The command, which gives a cell of twenty processes as long to start.
@@ -114,7 +116,7 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
 def demo(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A cell that has begun to be played on."""
     one = subprocess.Popen(
-        [*LIVE_RUN, str(CELL), "--scenario", "baseline", "--out", str(tmp_path / "out"), "--json"],
+        [*LIVE_RUN, str(LIGHT), "--scenario", "baseline", "--out", str(tmp_path / "out"), "--json"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -144,7 +146,7 @@ def test_interrupted_it_seals_its_run_and_ends_everything(
     demo: subprocess.Popen[str], tmp_path: Path
 ) -> None:
     of_it = psutil.Process(demo.pid).children(recursive=True)
-    assert len(of_it) > 15
+    assert len(of_it) > 10
     demo.send_signal(signal.SIGINT)
     told, said = demo.communicate(timeout=PATIENCE_S)
     assert demo.returncode == 130
@@ -185,7 +187,7 @@ def test_killed_it_leaves_no_process_port_or_shared_memory(demo: subprocess.Pope
 @TWO_CPUS
 def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> None:
     """The tutorial's cell under other names, with a delay on a link, and an observer beside it."""
-    beside = CELL.parents[1] / "live"
+    beside = LIGHT.parent
     text = re.sub(r"\bplanning\b", "plan it", (beside / "cell.yaml").read_text())
     (tmp_path / "cell.yaml").write_text(text.replace("name: light-follower", "name: S\u00fcd x"))
     document = to_document(dwell.load(tmp_path / "cell.yaml"))
@@ -196,7 +198,7 @@ def test_any_cell_with_stages_runs_and_its_observer_looks_on(tmp_path: Path) -> 
     stages = (beside / "stages.py").read_text().replace('"planning"', '"plan it"')
     (tmp_path / "stages.py").write_text(stages)
     (tmp_path / "looking.py").write_text(OBSERVER)
-    words = ["--scenario", "far", "--seconds", "8", "--policy", "SO", "--seed", "3"]
+    words = ["--scenario", "far", "--seconds", "6", "--policy", "SO", "--seed", "3"]
     done = subprocess.run(
         [*LIVE_RUN, str(tmp_path / "cell.yaml"), *words, "--out", str(tmp_path / "out"), "--json"],
         capture_output=True,
@@ -235,7 +237,7 @@ for module in {hidden!r}:
 @pytest.mark.parametrize("extra", ["live", "sim"])
 def test_it_needs_no_more_than_the_extra_live(extra: str, tmp_path: Path) -> None:
     cell, site = tmp_path / "cell" / "cell.yaml", tmp_path / "site"
-    shutil.copytree(CELL.parents[1] / "live", cell.parent)
+    shutil.copytree(LIGHT.parent, cell.parent)
     text = cell.read_text()
     assert "at_s: 8, for_s: 10" in text
     cell.write_text(text.replace("at_s: 8, for_s: 10", "at_s: 2, for_s: 2"))
@@ -303,7 +305,7 @@ class Looking:
     ],
 )
 def test_what_cannot_be_run_is_said(change: dict[str, Any], said: str, tmp_path: Path) -> None:
-    document = to_document(dwell.load(CELL.parents[1] / "live" / "cell.yaml"))
+    document = to_document(dwell.load(LIGHT))
     for task in change.get("without", ()):
         del document["tasks"][task]["run"]
     if "run" in change:

@@ -15,8 +15,8 @@ from dwell.cli.output import aligned, print_json
 from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.live.host.security import Security, environment, exposed
 from dwell.live.host.stage_modules import actuator_of, ros_topics, stage_of
-from dwell.live.lint import lint
 from dwell.live.stage import CellStage
+from dwell.live.wire.lint import lint
 from dwell.live.wire.wiring import PORTS_PER_ROLE, Role, Wiring, roles, wire
 from dwell.model import Problem
 from dwell.model.bounds import counted

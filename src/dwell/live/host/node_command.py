@@ -22,9 +22,9 @@ from dwell.live.host.parent_death import end_with_owner
 from dwell.live.host.role_command import server, words
 from dwell.live.host.security import environment
 from dwell.live.host.state_folder import state_root
-from dwell.live.lint import lint
 from dwell.live.log import say
 from dwell.live.stage import load_function
+from dwell.live.wire.lint import lint
 from dwell.live.wire.wiring import roles
 from dwell.model import Problem
 

@@ -474,6 +474,7 @@ class LiveWindows:
         shadows = sends_shadows(self._controller)
         known, ages = told(cycles), self.record.ages
         ages.judge(cycles, close_ns, ages.known)
+        ages_ns, age_ms = ages.seen(self._recent(cycles), cycles, close_ns)
         return ClosedWindow(
             latency_ns=np.array([cycle.latency_ns for cycle in known], np.int64),
             release_ns=np.array([cycle.at_ns for cycle in known], np.int64),
@@ -483,7 +484,18 @@ class LiveWindows:
             looked=LookedAt(window, row, end - begin),
             evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
             over_age=np.array([cycle.over_age for cycle in known], np.bool_),
+            ages_ns=ages_ns,
+            age_ms=age_ms,
         )
+
+    def _recent(self, cycles: list[LiveCycle]) -> list[LiveCycle]:
+        """Return the cycles whose commands may count in the ages of some cycles, by number."""
+        reach_ns = self.record.ages.reach_ns
+        if not reach_ns:
+            return cycles
+        since_ns = cycles[0].at_ns - reach_ns
+        recent = (cycle for cycle in self._by_key.values() if cycle.at_ns >= since_ns)
+        return sorted(recent, key=lambda cycle: cycle.key)
 
     def _seen(
         self,
@@ -506,6 +518,7 @@ class LiveWindows:
             rate_at_close=violation_rate(told(cycles), self._deadline_ns),
             used=self._controller.utilisation(closed),
             closed_unix_ns=unix_ns,
+            age_ms=closed.age_ms,
         )
 
     def finish(self) -> None:

@@ -13,19 +13,20 @@ def origins_of(header: Header) -> tuple[Origin, ...]:
     return sender.origins if isinstance(sender, RatedHop) else ()
 
 
-def oldest_origins(headers: Iterable[Header]) -> dict[str, Origin]:
-    """Return the oldest cycle from which messages descend, by task."""
-    oldest: dict[str, Origin] = {}
+def joint_origins(headers: Iterable[Header]) -> dict[str, Origin]:
+    """Return the oldest and newest cycle from which messages descend, by task."""
+    joint: dict[str, Origin] = {}
     for header in headers:
         for one in origins_of(header):
-            known = oldest.setdefault(one.task, one)
-            if one.released_ns < known.released_ns:
-                oldest[one.task] = one
-    return oldest
+            known = joint.setdefault(one.task, one)
+            oldest = one if one.released_ns < known.released_ns else known
+            newest = max(one.newest, known.newest)
+            joint[one.task] = Origin(one.task, oldest.cycle, oldest.released_ns, newest)
+    return joint
 
 
 def origin_of(hop: Hop | None, task: str) -> Origin | None:
-    """Return the oldest cycle of a task from which a job descends, or None."""
+    """Return the cycles of a task from which a job descends, or None."""
     origins = hop.origins if isinstance(hop, RatedHop) else ()
     return next((one for one in origins if one.task == task), None)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from dwell.control import Controller, Proposal, final_l95_ms
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
-from dwell.live.roles.data_ages import DataAges
+from dwell.live.roles.data_ages import DataAges, KnownOrigins
 from dwell.live.roles.loads import ProcessLoads
 from dwell.live.roles.offsets import UNBOUNDED_NS
 from dwell.live.wire.messages import NOT_APPLIED
@@ -27,6 +27,8 @@ from dwell.model.instants import NEVER_NS
 from dwell.record import Columns, Feature, Row, Values, column_types, row_of
 
 Rows: TypeAlias = dict[str, list[Row]]
+#: Estimates of a candidate in the status.
+PREDICTED = "l95_ms", "violation_rate", "age_ms"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +67,10 @@ class LiveWindow:
         Whether the bound exceeds 20 % of D, or the outcome of a cycle is unknown.
     rate_at_close : float
         V_D as known at the end of the window.
-    known_origins : dict of str to int
-        Release of the last origin before the window, by chain.
+    known_origins : dict of str to KnownOrigins
+        Origins of the actuations before the window, by chain.
+    age_ms : float or None
+        Mean age of the newest command, if J weighs it.
     used : float64 array, shape (3, resources)
         Utilisation by all work, by the cell's jobs, and by shadows.
     seen : tuple of float or None
@@ -85,7 +89,8 @@ class LiveWindow:
     used: NDArray[np.float64]
     closed_unix_ns: int | None
     seen: tuple[float | None, ...] = (None, None, None)
-    known_origins: Mapping[str, int] = field(default_factory=dict)
+    known_origins: Mapping[str, KnownOrigins] = field(default_factory=dict)
+    age_ms: float | None = None
 
     def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
         """Return a proposal and its cycles for the status."""
@@ -101,12 +106,12 @@ class LiveWindow:
             "l95_ms": l95_ms,
             "violation_rate": self.rate_at_close,
             "cost": cost,
+            "mean_age_ms": self.age_ms,
             "reason": decision.reason,
             "decided": decision.name,
             "estimates": {name: decision.costs.get(name) for name in names},
             "predicted": {
-                name: {of: priced[f"est_{of}_{name}"] for of in ("l95_ms", "violation_rate")}
-                for name in names
+                name: {of: priced.get(f"est_{of}_{name}") for of in PREDICTED} for name in names
             },
             "utilisation": {
                 name: _known(share)
@@ -129,6 +134,8 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
     features: list[Feature] = ["live", *controller.features]
     if sends_shadows(controller):
         features.append("shadows")
+    if controller.problem.objective.latency is not None:
+        features.append("chain")
     if controller.problem.replicas:
         features.append("replicas")
     tables = ["cycles", "windows", "decisions", *(("jobs", "processes") if jobs else ())]
@@ -158,6 +165,8 @@ class RunRows:
         self._warmup_windows, self._kept = problem.warmup_windows, kept
         self._deadline_ns = problem.pipeline.deadline_ns
         self._sends_shadows = sends_shadows(controller)
+        self._weighs_age = problem.objective.weighs_age
+        self._has_prices = problem.fabric.has_prices
         self._jobs = resume.jobs
         self._columns = columns_of(controller, jobs=resume.jobs)
         #: Row of the next cycle, and the last cycle that is known to be complete.
@@ -200,6 +209,9 @@ class RunRows:
             self._changed[cycle.row] = cycle
             if cycle.window is not None:
                 self._changed_windows.add(cycle.window)
+                if self.ages.known:
+                    # The next window's reaction times depend on this one's actuations.
+                    self._changed_windows.add(cycle.window + 1)
 
     def rows(self, *, last: bool = False) -> Rows:
         """Return the rows that are new or have changed since the last call.
@@ -273,12 +285,18 @@ class RunRows:
             "interval_ns": cycle.interval_ns,
             "stamper_interval_ns": cycle.stamper_interval_ns,
             "bound_ns": None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
+            **self.ages.cycle_values(cycle),
         }
 
     def _window_values(self, window: LiveWindow) -> Values:
         cycles, names = window.cycles, self._controller.resources
+        before = self._windows.get(window.number - 1)
+        known = window.known_origins
+        if before is not None:
+            known = self.ages.after(before.cycles, before.known_origins)
         busy, _, by_shadows = window.used.tolist()
         seen_l95_ms, seen_violation_rate, cost = map(_known, window.seen)
+        seen_age_ms = None if seen_l95_ms is None else window.age_ms
         latency_ns = np.array([cycle.latency_ns for cycle in told(cycles)], np.int64)
         values: dict[str, object] = {
             "window": window.number,
@@ -292,7 +310,10 @@ class RunRows:
             "seen_violation_rate": seen_violation_rate,
             **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
             "cost": cost,
-            **self.ages.values(cycles, window.known_origins),
+            **({"seen_age_ms": seen_age_ms} if self._weighs_age else {}),
+            # Only the simulator measures prices.
+            **({"seen_price_per_hour": None} if self._has_prices else {}),
+            **self.ages.values(cycles, known),
             "overtaken": sum(cycle.overtaken for cycle in cycles),
             "term": cycles[-1].term,
             "lead": window.lead,

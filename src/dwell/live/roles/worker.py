@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN, Counts
 from dwell.live.roles.joins import MAX_JOINS, Job, Joins
-from dwell.live.roles.origins import oldest_origins, origins_of
+from dwell.live.roles.origins import joint_origins, origins_of
 from dwell.live.roles.replicated_cycles import ReplicatedCycles
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.roles.sampled_inputs import SampledInputs
@@ -518,11 +518,11 @@ class Worker:
             put(data)
 
     def _origins(self, job: Job) -> tuple[Origin, ...]:
-        """Return the oldest cycles from which a job descends."""
+        """Return the cycles from which a job descends."""
         headers = (header for header, _, _ in (*job.inputs.values(), *job.values.values()))
-        origins, stamp = oldest_origins(headers), job.header.stamp
+        origins, stamp = joint_origins(headers), job.header.stamp
         if self._is_origin:
-            origins[self.task] = Origin(self.task, stamp.cycle, stamp.released_ns)
+            origins[self.task] = Origin(self.task, stamp.cycle, stamp.released_ns, stamp.cycle)
         return tuple(origins.values())
 
     def framed(self, now_ns: int) -> None:

@@ -141,14 +141,16 @@ class Hop(_Array, frozen=True):
 
 
 class Origin(_Array, frozen=True):
-    """A cycle from which a job descends, and its release on the stamper's clock.
+    """The oldest cycle from which a job descends, its release, and the newest such cycle.
 
-    `task` is a task that begins at a release, or the first task of a chain.
+    `task` is a task that begins at a release, or the first task of a chain. The release is on the
+    stamper's clock.
     """
 
     task: Name
     cycle: Count
     released_ns: Instant
+    newest: Count
 
 
 class RatedHop(Hop, frozen=True):
@@ -157,7 +159,7 @@ class RatedHop(Hop, frozen=True):
     Parameters
     ----------
     origins : tuple of Origin
-        Oldest cycles from which the job descends, one per task.
+        Cycles from which the job descends, one entry per task.
     """
 
     origins: Annotated[tuple[Origin, ...], msgspec.Meta(max_length=64)] = ()

@@ -190,7 +190,7 @@ def wire(problem: Problem, *, protocol: str = "tcp") -> Wiring:
     `protocol` is Zenoh's name of the protocol of all sessions. Raises a LiveError that lists all
     missing hosts, missing ports and conflicts, or the keys that live cells do not support.
     """
-    _require_latencies(problem)
+    _require_no_prices(problem)
     _require_states_in_step(problem)
     everybody = roles(problem)
     _require_hosts(problem, everybody)
@@ -350,22 +350,13 @@ def require_candidates(problem: Problem) -> None:
         raise ProblemError([Fault("candidates.all", f"{message}; {remedy}")])
 
 
-def _require_latencies(problem: Problem) -> None:
-    """Raise a LiveError if J needs ages or prices, which live windows do not have."""
-    objective = problem.objective
-    keys = {
-        "latency": objective.latency is not None,
-        "weights.age": objective.weighs_age,
-        "weights.price": objective.weighs_price,
-    }
-    lines = [
-        f"objective.{key}: not supported in the live cell {problem.name}; only the simulator "
-        "measures ages and prices: remove it, or use dwell run"
-        for key, there in keys.items()
-        if there
-    ]
-    if lines:
-        raise LiveError("\n".join(lines))
+def _require_no_prices(problem: Problem) -> None:
+    """Raise a LiveError if J needs prices, which live windows do not have."""
+    if problem.objective.weighs_price:
+        raise LiveError(
+            f"objective.weights.price: not supported in the live cell {problem.name}; only the "
+            "simulator measures prices: remove it, or use dwell run"
+        )
 
 
 def lagging_states(problem: Problem) -> Iterator[Fault]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import dwell
 from dwell.cellfile import from_document
-from dwell.live.lint import lint
+from dwell.live.wire.lint import lint
 from tests.cells.light import document
 
 

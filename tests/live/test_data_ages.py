@@ -1,0 +1,78 @@
+"""Ages of chains and of cycles in the objective of a live cell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from random import Random
+
+import polars as pl
+import polars.testing
+import pytest
+
+from dwell.model import Caps, Chain, MissCap, Problem, Targets, Weights
+from tests.live.rated_cells import SLOW, sampling, world_of
+from tests.live.replayed import SYNCHRONOUS, Clocks, messages_of, recorded, replay, simulate
+from tests.live.small_world import Staying, canonical, columns
+
+
+def aged(problem: Problem, latency: str | None) -> Problem:
+    """Let a cell weigh its mean age, and cap its misses; the age of a chain may be its latency."""
+    chains = problem.pipeline.chains or {"see": Chain("sensing", "control", 150)}
+    targets = Targets(latency_ms=100, age_ms=60.0)
+    objective = replace(
+        problem.objective,
+        weights=Weights(age=1.0),
+        targets=targets,
+        latency=latency,
+        caps=Caps(misses=MissCap(1, 20)),
+    )
+    return replace(problem, pipeline=replace(problem.pipeline, chains=chains), objective=objective)
+
+
+@pytest.mark.parametrize(
+    ("seed", "every", "latency"), [(0, 20, "see"), (1, 5, "see"), (2, 5, None)]
+)
+def test_a_simulated_run_with_ages_in_j_is_decided_on_in_the_same_way_live(
+    seed: int, every: int, latency: str | None, tmp_path: Path
+) -> None:
+    settings = {"min_dwell": 0, "min_improvement": 0.0, "order_lead_cycles": 2, "fallbacks": ()}
+    initial = Random(seed).choice(["LOC", "SO", "HYB"])
+    cell = canonical(
+        20, decide_cycles=every, estimator="tests.live.replayed:Dated", initial=initial, **settings
+    )
+    windows = 15 if every == 20 else 6
+    played = simulate(aged(cell, latency), "robot-cpu-stress", windows=windows, seed=seed)
+    _, controller, _, _, rows = replay(played, SYNCHRONOUS, messages_of(played, Clocks()))
+    live, simulated = recorded(tmp_path, controller, rows), played.run
+    count = live.decisions.height
+    assert count >= simulated.decisions.height - 1 > 10
+    assert {"est_age_ms_LOC", "est_misses_LOC", "seen_age_ms"} <= {*live.decisions.columns}
+    names = [name for name in simulated.decisions.columns if name in live.decisions.columns]
+    pl.testing.assert_frame_equal(
+        live.decisions.select(names), simulated.decisions.select(names)[:count], abs_tol=1e-6
+    )
+    known = simulated.windows[: live.windows.height]
+    names = [name for name in known.columns if not name.startswith("shadow_")]
+    pl.testing.assert_frame_equal(live.windows.select(names), known.select(names), abs_tol=1e-6)
+    cycles = [name for name in simulated.cycles.columns if name.startswith("chain_")]
+    assert len(cycles) == 2 * (latency is not None)
+    known = simulated.cycles[: live.cycles.height].select("missed", *cycles)
+    assert live.cycles.select("missed", *cycles).equals(known)
+
+
+def test_the_age_of_a_sampled_picture_takes_the_place_of_the_latency() -> None:
+    chains = {"see-act": {"from": "camera", "to": "act", "max_age_ms": 500}}
+    problem = aged(sampling(chains=chains), "see-act")
+    world = world_of(problem, policy=Staying())
+    world.run(1_000)
+    names = "seen_l95_ms", "age_l95_see-act", "l95_ms", "seen_age_ms"
+    steady = columns(world, "windows", *names)[1:]
+    assert len(steady) >= 3
+    for seen_ms, l95_ms, latency_ms, age_ms in steady:
+        assert seen_ms == l95_ms > 10 * latency_ms / 2 > 0
+        # Commands are SLOW to a picture, and the age grows until the next one.
+        assert age_ms == pytest.approx(l95_ms - 10 * (SLOW - 1) / 2 + 5, abs=0.5)
+    status = world.status["window"]
+    assert status["mean_age_ms"] > 0
+    assert status["predicted"]["LOC"]["age_ms"] > 0
