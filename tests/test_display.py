@@ -70,7 +70,7 @@ FEW_NUMBERS = {
         "Episodes",
         "Family",
         "MissCap",
-        *("Replicas", "Replicate"),
+        "Replicas",
         "Move",
         "PairedDifference",
         "PairedMedian",
