@@ -308,7 +308,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 def wholes() -> list[msgspec.Struct]:
     """Return a message of every kind, most of their fields filled in."""
     return [
-        *(STAMP, messages.Stamped(**msgspec.structs.asdict(STAMP), intervals=((4, 9),)), HOP),
+        *(STAMP, messages.Stamped(**msgspec.structs.asdict(STAMP), intervals=((4, 9, 1),)), HOP),
         Header(STAMP, "sensing", "R1", "bytes", (HOP,)),
         Completion(STAMP, "control", 9, "actuated", (HOP,), "R2"),
         *(ORIGIN, RATED_HOP, messages.RatedHeader(STAMP, "sensing", "R1", "bytes", (RATED_HOP,))),

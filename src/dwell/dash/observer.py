@@ -305,7 +305,7 @@ class Observer:
         before = None if self._newest is None else self._newest[0]
         if stamp.placement not in self.problem.candidates:
             raise LiveError(f"the stamper says {printable(stamp.placement)[:60]!r} holds")
-        for number, interval_ns in stamp.intervals:
+        for number, interval_ns, _ in stamp.intervals:
             timed = self._open.get((stamp.run, number))
             if timed is not None:
                 timed.stamper_interval_ns = interval_ns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from msgspec.structs import replace
 
 from dwell.live.roles.latencies import SPAN_NS, Intervals
 from dwell.live.roles.run_rows import columns_of
@@ -100,10 +101,10 @@ def test_a_cycle_ends_with_its_last_sink_and_copies_change_nothing() -> None:
     intervals.completed(done(5), 40 * MS, newest=5, direct=True)
     intervals.completed(done(5), 60 * MS, newest=5, direct=False)
     assert intervals.take_unreported() == ()
-    intervals.completed(done(5, "gripper"), 50 * MS, newest=5, direct=True)
+    intervals.completed(replace(done(5, "gripper"), rested=True), 50 * MS, newest=5, direct=True)
     intervals.completed(done(5, "gripper"), 70 * MS, newest=5, direct=True)
     intervals.completed(done(5, "nobody"), 80 * MS, newest=5, direct=True)
-    assert intervals.take_unreported() == ((5, 48 * MS),)
+    assert intervals.take_unreported() == ((5, 48 * MS, 1),)
     assert intervals.take_unreported() == ()
 
 

@@ -670,10 +670,10 @@ def test_what_the_stamper_heard_is_done_until_the_sink_says_when() -> None:
     hand = Hand()
     hand.release(range(W + 2))
     hand.done(0)
-    hand.windows.measured(1, [(1, 13 * MS), (2, 17 * MS)])
+    hand.windows.measured(1, [(1, 13 * MS, 0), (2, 17 * MS, 0)])
     hand.close()
     # Not yet said when the window closed.
-    hand.windows.measured(1, [(3, 19 * MS)])
+    hand.windows.measured(1, [(3, 19 * MS, 0)])
     hand.record()
     assert hand.column("cycles", "outcome") == ["done"] * 4 + ["in_flight"]
     assert hand.column("cycles", "latency_ns")[1:4] == [13 * MS, 17 * MS, 19 * MS]

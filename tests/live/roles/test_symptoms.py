@@ -62,6 +62,21 @@ def test_the_last_command_that_was_applied_has_an_age(problem: Problem) -> None:
     assert 900 < sinks["control"]["applied_age_ms"] < 1_100
 
 
+def test_silences_count_although_the_sink_cannot_reach_the_controller(problem: Problem) -> None:
+    world = World(on(problem, "LOC"), policy="LOC")
+    world.run(3_000)
+    world.network.cut("R2", "E")
+    cut = world.network.cut("R1", "R2", key="**/in/**")
+    world.run(500)
+    world.network.heal(cut)
+    world.run(2_000)
+    found = symptoms(world)
+    recent = found["recent"]
+    assert isinstance(recent, dict)
+    assert world.sink.counts["silences"] == 1
+    assert (found["silences"], sum(recent["silences"])) == (1, 1)
+
+
 def test_shadows_of_long_ago_say_nothing(problem: Problem) -> None:
     cell = canonical(20, estimator="shadow", shadow_fraction=0.2)
     world = World(cell, policy="LOC")

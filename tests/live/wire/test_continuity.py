@@ -365,7 +365,7 @@ def test_a_false_completion_stops_no_intervals() -> None:
     for cycle in (3, HUGE, 4):
         done = Completion(Stamp(1, cycle, 1, "LOC", 0), "arm", 0, "actuated", (), "R2")
         intervals.completed(done, 40 * MS, newest=5, direct=True)
-    assert [cycle for cycle, _ in intervals.take_unreported()] == [3, 4]
+    assert [cycle for cycle, _, _ in intervals.take_unreported()] == [3, 4]
 
 
 def test_one_false_instant_does_not_widen_the_clocks_bounds_for_ever() -> None:

@@ -107,6 +107,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         Time from the arrival of its stamp to the arrival of its last completion, at the controller.
     stamper_interval_ns : int or None
         Time from its release to its last completion, on the stamper's clock alone.
+    stamper_silences : int
+        Silences that the stamper has reported with this time.
     told : bool
         Whether its latency is `stamper_interval_ns`, because not all sinks have reported here.
     deaf : bool
@@ -140,6 +142,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     bound_ns: int = 0
     interval_ns: int | None = None
     stamper_interval_ns: int | None = None
+    stamper_silences: int = 0
     told: bool = False
     deaf: bool = False
     row: int = -1
@@ -229,7 +232,9 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     @property
     def silences(self) -> int:
         """Number of applied commands of this cycle that found their actuator at rest."""
-        return sum(done.rested and done.outcome == ACTUATED for done in self.reports.values())
+        reports = self.reports.values()
+        known = sum(done.rested and done.outcome == ACTUATED for done in reports)
+        return max(known, self.stamper_silences)
 
     def came_to(self, *outcomes: str) -> bool:
         """Whether a sink has reported one of these outcomes."""

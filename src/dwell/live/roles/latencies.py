@@ -49,6 +49,7 @@ class _Waiting:
     said: set[str] = field(default_factory=set)
     end_ns: int = 0
     known: bool = True
+    silences: int = 0
 
 
 class Intervals:
@@ -58,7 +59,7 @@ class Intervals:
         self._node, self._sinks = node, sinks
         self._best = {node: _Best(0, 0)}
         self._waiting: dict[int, _Waiting] = {}
-        self._unreported: list[tuple[int, int]] = []
+        self._unreported: list[tuple[int, int, int]] = []
 
     def hear(self, beat: Beat, now_ns: int) -> None:
         """Measure the round trip to a node by a direct beat."""
@@ -93,16 +94,21 @@ class Intervals:
         if done.sink in waiting.said or done.sink not in sinks:
             return
         waiting.said.add(done.sink)
+        waiting.silences += done.rested
         back_ns = self.return_ns(done.node) if direct else None
         if back_ns is None:
             waiting.known = False
         else:
             waiting.end_ns = max(waiting.end_ns, now_ns - back_ns)
         if waiting.known and waiting.said == sinks:
-            self._unreported.append((cycle, max(waiting.end_ns - done.stamp.released_ns, 0)))
+            interval_ns = max(waiting.end_ns - done.stamp.released_ns, 0)
+            self._unreported.append((cycle, interval_ns, waiting.silences))
             del self._unreported[:-MOST_REPORTED]
 
-    def take_unreported(self) -> tuple[tuple[int, int], ...]:
-        """Return the cycles and intervals, ns, that are new since the last call."""
+    def take_unreported(self) -> tuple[tuple[int, int, int], ...]:
+        """Return cycles, intervals, ns, and silences that are new since the last call.
+
+        The silences are the commands of the cycle that found their actuator at rest.
+        """
         reported, self._unreported = tuple(self._unreported), []
         return reported

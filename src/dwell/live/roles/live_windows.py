@@ -156,10 +156,12 @@ class LiveWindows:
             self.ignored += 1
             return
         cycle = self._note(completion.stamp, at_ns)
+        silences = 0 if cycle is None else cycle.silences
         if cycle is None or not cycle.take(completion, at_ns):
             return
         if at_ns is not None and cycle.reports.get(completion.sink) is completion:
             self._symptoms.completed(completion, at_ns)
+        self._symptoms.silenced(cycle.silences - silences)
         if self._ledger.complete(cycle):
             self.record.newest_done = max(self.record.newest_done, cycle.key)
         # Settle cycles one by one, not all at the end of the window, if the error bound permits.
@@ -167,12 +169,14 @@ class LiveWindows:
         self._ledger.settle(cycle, most_ns=None if settled else self._proven_ns)
         self.record.touch(cycle)
 
-    def measured(self, run: int, intervals: Iterable[tuple[int, int]]) -> None:
-        """Add the intervals of cycles, ns, that the stamper has measured."""
-        for number, interval_ns in intervals:
+    def measured(self, run: int, intervals: Iterable[tuple[int, int, int]]) -> None:
+        """Add the intervals, ns, and silences of cycles that the stamper has measured."""
+        for number, interval_ns, silences in intervals:
             cycle = self._by_key.get((run, number))
             if cycle is not None:
-                cycle.stamper_interval_ns = interval_ns
+                known = cycle.silences
+                cycle.stamper_interval_ns, cycle.stamper_silences = interval_ns, silences
+                self._symptoms.silenced(cycle.silences - known)
                 self.record.newest_done = max(self.record.newest_done, cycle.key)
                 if cycle.row >= 0:
                     self._ledger.settle(cycle)

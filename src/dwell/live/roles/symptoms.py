@@ -60,7 +60,10 @@ class Symptoms:
         self._outcomes[completion.sink] = completion.outcome
         if completion.outcome == ACTUATED:
             self._applied_ns[completion.sink] = at_ns
-            self._silences += completion.rested
+
+    def silenced(self, silences: int) -> None:
+        """Record reports of calls of `hold` or `zero`."""
+        self._silences += silences
 
     def closed(self, window: LiveWindow) -> None:
         """Add a closed window."""

@@ -90,15 +90,16 @@ class Stamped(Stamp, frozen=True):
 
     Parameters
     ----------
-    intervals : tuple of (int, int)
-        Earlier cycles of the run and their durations by the stamper's clock alone, ns (see
-        `dwell.live.roles.latencies`); each cycle is sent once.
+    intervals : tuple of (int, int, int)
+        Earlier cycles of the run, their durations by the stamper's clock alone, ns (see
+        `dwell.live.roles.latencies`), and the number of their commands that found the actuator at
+        rest; each cycle is sent once.
     group_ns : int
         CPU time that the control group on the stamper's node had used at the release; -1 if
         unknown.
     """
 
-    intervals: Annotated[tuple[tuple[Count, Count], ...], msgspec.Meta(max_length=64)] = ()
+    intervals: Annotated[tuple[tuple[Count, Count, Count], ...], msgspec.Meta(max_length=64)] = ()
     group_ns: Spent = -1
 
 
