@@ -40,6 +40,7 @@ from dwell.model import (
 )
 from dwell.model.fleet import Fleet, FleetEntry
 from dwell.policies import by_name as policy_by_name
+from dwell.policies.registry import REGISTRY as POLICIES
 from dwell.record import Journal
 from dwell.study import (
     Hindsight,
@@ -69,7 +70,7 @@ FEW_NUMBERS = {
         "Episodes",
         "Family",
         "MissCap",
-        *("Replicas", "Replicate"),
+        "Replicas",
         "Move",
         "PairedDifference",
         "PairedMedian",
@@ -155,7 +156,7 @@ def objects(
     known = QoS(20.0, 0.0, dict.fromkeys(canonical.fabric.nodes, 0.5))
     proposal = controller.propose_by(known, dict.fromkeys(canonical.fabric.nodes, 0.5))
     table = TraceTable("drive.csv", {"rtt_ms": np.arange(5_000.0)})
-    policies = ("dtp", "latency-first", "work-function", "atp", "atp-thresholds", "cusum", "LOC")
+    policies = (*POLICIES, "LOC")
     files = ("fan-in.yaml", "cloud.yaml", "live/cell.yaml", "visual_servoing/testbed.yaml")
     trees: list[object] = [
         *shown.values(),

@@ -13,10 +13,10 @@ from typing import TypeAlias
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 from scipy.stats import spearmanr
 
 from dwell.model import Servo
-from dwell.model.number_arrays import Floats
 from dwell.study import Interval, Point, StudyResult, compare, run_study
 from reproduction.cell import DYNAMIC, RANDOM, STEADY, TIMETABLE, TIMETABLE_WINDOWS, paper_cell
 from reproduction.evidence.measured_on import measured_on
@@ -32,6 +32,7 @@ RANKING = {"aoi_mean_ms": "mean age", "l95_ms": "L95", "violation_rate": "V_D"}
 ERROR = "tracking_rms_mm"
 RESAMPLES = 200
 
+Floats: TypeAlias = NDArray[np.float64]
 Rank: TypeAlias = Callable[[Floats, Floats], float]
 
 TEXT = """# Age in place of L95 and V_D

@@ -75,7 +75,9 @@ class Played:
     seen: Seen
 
 
-def simulate(problem: Problem, scenario: str, windows: int = 25, seed: int = 5) -> Played:
+def simulate(
+    problem: Problem, scenario: str, windows: int = 25, seed: int = 5, *, guard: bool = False
+) -> Played:
     """Simulate a run and keep what its controller was given."""
     kept: list[tuple[Seen, engine.SimulatedStamper]] = []
     consult, every = engine.SimulatedStamper.consult, problem.decide_cycles
@@ -110,7 +112,9 @@ def simulate(problem: Problem, scenario: str, windows: int = 25, seed: int = 5) 
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(engine.SimulatedStamper, "consult", spy)
-        run = dwell.simulate(problem, scenario=scenario, seed=seed, windows=windows, jobs=True)
+        run = dwell.simulate(
+            problem, scenario=scenario, seed=seed, windows=windows, jobs=True, guard=guard
+        )
     seen, stamper = kept[0]
     if often:
         tables = stamper.arrays.tables

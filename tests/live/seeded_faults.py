@@ -61,6 +61,8 @@ from tests.live.small_world import MS, World, columns, on
 COUNTS, SHARES = (1, 2, 3, 4), (6, 2, 1, 1)
 #: Which candidate the controller wants to be at; nothing where it goes round all of them.
 WISHES = ("LOC", "SO", "HYB", "")
+#: Candidate with replicas, at which the cells of a share of the seeds stay.
+BOTH, REPLICATED = "BOTH", 0.15
 #: What the clocks show at first: none is set back beyond 0.
 START_NS = 1_000_000_000_000
 #: Time in which a cell has to be at home after its start.
@@ -98,6 +100,14 @@ def light_cell() -> Problem:
 
 
 @cache
+def replicated_cell() -> Problem:
+    """Return the light cell with a candidate with replicas."""
+    given = document("SO")
+    candidates = {**given["candidates"], BOTH: {"replicas": ["LOC", "SO"]}}
+    return from_document({**given, "candidates": candidates})
+
+
+@cache
 def faults_in_memory() -> tuple[Fault, ...]:
     """Return every fault that can be brought about in memory."""
     problem = light_cell()
@@ -123,7 +133,7 @@ class Plan:
     Parameters
     ----------
     wish : str
-        One of `WISHES`.
+        One of `WISHES`, or `BOTH`.
     delay_ms : float
         Of every message.
     decide_cycles : int
@@ -141,6 +151,8 @@ class Plan:
         """Draw the faults of a seed; most often one, which has a bound."""
         draw = Random(f"plan {seed}")
         wish, delay_ms = draw.choice(WISHES), draw.choice((0.2, 1.0, 4.0))
+        if Random(f"replicas {seed}").random() < REPLICATED:
+            wish = BOTH
         (count,) = draw.choices(COUNTS, SHARES)
         faults = tuple(islice(planned(seed, faults_in_memory()), count))
         every = Random(f"decisions {seed}").randint(1, WINDOW_CYCLES)
@@ -292,7 +304,8 @@ class FaultyWorld(World):
         self._freezes: Counter[MemoryTransport] = Counter()
         # Nodes whose time of day was never set.
         self.unset: set[str] = set()
-        problem = on(light_cell(), plan.wish or "SO")
+        cell = replicated_cell() if plan.wish == BOTH else light_cell()
+        problem = on(cell, plan.wish or "SO")
         self.frames_per_period = 1.0
         paced = any(one.fault.how == "pace" for one in plan.faults)
         if paced:
@@ -363,6 +376,11 @@ class FaultyWorld(World):
         since_ns = self.network.now_ns - RECENT_PERIODS * self.period_ns
         recent = takewhile(lambda one: one.at_ns >= since_ns, reversed(self.seen))
         applied = [one for one in recent if one.what == APPLY]
+        if home == BOTH:
+            # The nodes of a command show only the copy that came first.
+            if (where := self._status().get("placement")) != BOTH:
+                return f"it is at {where}"
+            home = None
         return away_from_home(self.problem, home, applied[::-1], self._status)
 
     def _status(self) -> Mapping[str, Any]:
@@ -782,7 +800,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """See the module."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, help="play the faults of this seed")
-    parser.add_argument("--wish", choices=WISHES, help="where the controller wants to be")
+    parser.add_argument("--wish", choices=(*WISHES, BOTH), help="where the controller wants to be")
     parser.add_argument("--delay-ms", type=float, help="of every message")
     parser.add_argument("--decide-cycles", type=int, help="cycles between two decisions")
     parser.add_argument("--play", nargs="*", type=_read, help="play these faults instead")

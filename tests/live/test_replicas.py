@@ -154,6 +154,35 @@ def test_the_death_of_the_second_node_costs_no_cycle() -> None:
     assert {missed for (missed,) in columns(world, "cycles", "missed")} == {False}
 
 
+def test_the_guard_leaves_replicas_of_which_no_copy_completes() -> None:
+    world = ReplicatedWorld(replicated(fallbacks=["HYB"], on="R2", probe_cycles=5), policy="BOTH")
+    world.run(500)
+    broken = "perception@R1", "planning@E"
+    for who in broken:
+        world.kill(who)
+        world.run(300)
+    # The first death cost no cycle, so the guard moved after the second one.
+    assert [name for _, name, _ in world.stamper.moves] == ["HYB"]
+    # A probe goes through one copy, and proves both.
+    world.start("perception@R1")
+    world.run(1_500)
+    assert [(name, by) for _, name, by in world.stamper.moves[1:]] == [("BOTH", "order")]
+    assert world.cycles[-1] > world.stamper.cycle - 3
+
+
+def test_shadows_go_through_no_member_while_both_copies_run() -> None:
+    world = ReplicatedWorld(replicated(fallbacks=["HYB"]))
+    world.stamper.shadow_fraction = 0.5
+    world.run(600)
+    shadows = [done for done in world.ended if done.outcome == "shadow"]
+    assert len(shadows) > 5
+    assert {done.stamp.shadow for done in shadows} == {"HYB"}
+    # A task with two nodes is apart from its shadow, even on a node of one of the copies.
+    for done in shadows:
+        assert {"perception@E", "planning@R2"} <= {f"{hop.task}@{hop.node}" for hop in done.hops}
+    assert steps(world.cycles) == {1}
+
+
 @pytest.fixture
 def seals(tmp_path: Path) -> dict[str, Seals]:
     authority = Authority.create(tmp_path, "canonical")
@@ -271,10 +300,11 @@ def messages_of_copies(played: Played) -> Iterator[Event]:
 
 
 @pytest.mark.parametrize(
-    ("after_ms", "every", "initial"), [(0.0, 20, "LOC"), (15.0, 6, "BOTH"), (22.0, 20, "BOTH")]
+    ("after_ms", "every", "initial", "fallbacks"),
+    [(0.0, 20, "LOC", ()), (15.0, 6, "BOTH", ("HYB",)), (22.0, 20, "BOTH", ())],
 )
 def test_a_simulated_run_with_replicas_is_decided_on_in_the_same_way_live(
-    after_ms: float, every: int, initial: str, tmp_path: Path
+    after_ms: float, every: int, initial: str, fallbacks: tuple[str, ...], tmp_path: Path
 ) -> None:
     cell = replicated(
         after_ms=after_ms,
@@ -284,8 +314,9 @@ def test_a_simulated_run_with_replicas_is_decided_on_in_the_same_way_live(
         min_dwell=0,
         min_improvement=0.0,
         order_lead_cycles=2,
+        fallbacks=fallbacks,
     )
-    played = simulate(cell, "robot-cpu-stress", windows=12, seed=0)
+    played = simulate(cell, "robot-cpu-stress", windows=12, seed=0, guard=bool(fallbacks))
     _, controller, _, evidence, rows = replay(played, SYNCHRONOUS, messages_of_copies(played))
     live, simulated = recorded(tmp_path, controller, rows), played.run
     assert {"BOTH", "LOC"} <= {*simulated.windows["placement"]}

@@ -122,9 +122,12 @@ def test_estimators_learn_from_a_slow_copy(estimator: str) -> None:
     assert last["est_violation_rate_TWO"] < 0.1
 
 
-def failing(*nodes: str) -> Problem:
+def failing(**for_s: float) -> Problem:
     """Return the cell with a third candidate, and a scenario: nodes are down from 3 s on."""
-    disturbances = [{"node": name, "at_s": 3, "for_s": 100, "down": True} for name in nodes]
+    disturbances = [
+        {"node": name, "at_s": 3, "for_s": length_s, "down": True}
+        for name, length_s in for_s.items()
+    ]
     work = {"on": {name: {"exec_ms": 0.5} for name in "ABC"}}
     return from_document(
         {
@@ -136,7 +139,7 @@ def failing(*nodes: str) -> Problem:
             ],
             "tasks": {**CELL["tasks"], "work": work},
             "candidates": {**CELL["candidates"], "THREE": {"work": "C"}},
-            "controller": {"fallbacks": ["THREE", "ONE"], "probe_cycles": 5},
+            "controller": {"on": "R", "fallbacks": ["THREE", "ONE"], "probe_cycles": 5},
             "scenarios": {"fails": disturbances},
         }
     )
@@ -162,26 +165,24 @@ def guarded(problem: Problem, wish: str) -> dwell.Run:
 
 
 def test_the_guard_stays_while_one_copy_completes_cycles() -> None:
-    run = guarded(failing("A"), "NOW")
+    run = guarded(failing(A=100), "NOW")
     assert {*run.cycles["placement"]} == {"NOW"}
     assert {*run.cycles["outcome"]} == {"done"}
 
 
 def test_the_guard_leaves_replicas_of_which_neither_copy_completes_cycles() -> None:
-    run = guarded(failing("A", "B"), "NOW")
+    run = guarded(failing(A=100, B=100), "NOW")
     lost = (run.cycles["outcome"] != "done").to_list()
     # Patience is three periods; two more cycles are released up to the move.
     assert lost == [False] * 15 + [True] * 3 + [False] * (len(lost) - 18)
     assert run.cycles["placement"].to_list() == ["NOW"] * 18 + ["THREE"] * (len(lost) - 18)
 
 
-@pytest.mark.parametrize(("down", "returns"), [("A", False), ("B", True)])
-def test_probes_of_replicas_go_through_their_first_member(down: str, returns: bool) -> None:
-    problem = failing("A", "B")
-    (one,) = (item for item in problem.scenario("fails") if down != item.node)
-    others = [item for item in problem.scenario("fails") if down == item.node]
-    problem = replace(problem, scenarios={"fails": (replace(one, for_s=10.0), *others)})
-    run = guarded(problem, "NOW")
+@pytest.mark.parametrize(("a_for_s", "b_for_s", "returns"), [(100, 10, False), (10, 100, True)])
+def test_probes_of_replicas_go_through_their_first_member(
+    a_for_s: float, b_for_s: float, returns: bool
+) -> None:
+    run = guarded(failing(A=a_for_s, B=b_for_s), "NOW")
     assert (run.cycles["placement"][-1] == "NOW") == returns
 
 
@@ -199,7 +200,7 @@ def test_no_shadow_goes_through_a_member_of_the_replicas_in_force() -> None:
 
 
 def test_messages_to_a_node_that_is_down_are_not_cancelled() -> None:
-    problem, probe = failing("B"), Probe(0.0)
+    problem, probe = failing(B=100), Probe(0.0)
     dwell.simulate(problem, policy="NOW", estimator=probe, scenario="fails", seed=1, windows=3)
     link = Message("camera", "work", "R->B")
     first, *_, last = (Meter(problem).times(seen)[link] for seen in probe.evidence)

@@ -142,10 +142,15 @@ class Loads:
             By cell, J of every candidate without other cells.
         """
         loads = self.at(placements).loads
-        costs = [
-            mine[name] + self.wait(i, name, loads.get(self.resource(i, name) or "", 0.0))
-            for i, (name, mine) in enumerate(zip(placements, alone, strict=True))
-        ]
+        waits: dict[tuple[int, str], float] = {}
+        costs = []
+        for i, (name, mine) in enumerate(zip(placements, alone, strict=True)):
+            group = self._kinds[i], name
+            wait = waits.get(group)
+            if wait is None:
+                load = loads.get(self.resource(i, name) or "", 0.0)
+                wait = waits[group] = self.wait(i, name, load)
+            costs.append(mine[name] + wait)
         return [*costs, sum(self._of_one[one] * load for one, load in loads.items())]
 
 

@@ -202,7 +202,7 @@ WINDOWS = (
         "seen_price_per_hour",
         "Float64",
         "Price of the bytes that links transmitted up to the close, money per hour.",
-        null=UNSEEN,
+        null=f"{UNSEEN}, or a live cell",
         of=PRICE,
     ),
     Column("cost", "Float64", "J of the observed QoS.", null=UNSEEN),

@@ -313,3 +313,17 @@ def test_states_of_a_later_second_copy_are_refused(after_ms: float, state_bytes:
     connected = {frozenset((one.source, one.target)) for one in wire(problem).wires}
     for who in ("camera@R1", "perception@E", "planning@E"):
         assert frozenset((who, "sink.control@R2")) in connected
+
+
+def test_a_weighed_price_is_refused_but_not_prices_alone() -> None:
+    problem = dwell.load("examples/live/cell.yaml")
+    links = {name: replace(one, price_per_gb=0.5) for name, one in problem.fabric.links.items()}
+    problem = replace(problem, fabric=replace(problem.fabric, links=links))
+    assert wire(problem).wires
+    objective = replace(
+        problem.objective,
+        weights=replace(problem.objective.weights, price=1.0),
+        targets=replace(problem.objective.targets, price_per_hour=1.0),
+    )
+    with pytest.raises(LiveError, match=r"objective\.weights\.price: not supported"):
+        wire(replace(problem, objective=objective))

@@ -604,6 +604,7 @@ class Ledger:
 
     def _job_values(self, cycle: LiveCycle, jobs: Jobs, key: JobName) -> Values | None:
         hop, shadow = jobs[key], key[0]
+        is_second = not shadow and self._is_second(cycle, hop.task, hop.node)
         ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
         if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
             return None
@@ -630,7 +631,7 @@ class Ledger:
             ),
             "outcome": "done" if ended else "replaced",
             "shadow": shadow,
-            **({"second": self._is_second(cycle, *key[1:])} if self._copies > 1 else {}),
+            **({"second": is_second} if self._copies > 1 else {}),
             **{name: ns if ended and ns != UNKNOWN else None for name, ns in counted_ns.items()},
         }
 
@@ -654,7 +655,7 @@ class Ledger:
                 for report in cycle.shadows:
                     self._doubt(cycle, report)
                     ran = self._ran(report)
-                    self._enter(of_shadows, row, cycle, ran, apart)
+                    self._enter(of_shadows, row, cycle, ran, apart, shadow=True)
                     # Jobs that the shadow shares with the cycle, whose own report may be missing.
                     self._enter(known, row, cycle, ran, self._every - apart)
                     if len(ran) < len(report.hops):
@@ -714,6 +715,8 @@ class Ledger:
         cycle: LiveCycle,
         hops: Iterable[Hop],
         apart: frozenset[str],
+        *,
+        shadow: bool = False,
     ) -> None:
         """Enter instants and work of jobs, and the instants of the messages that reached them."""
         hops = tuple(hops)
@@ -721,7 +724,8 @@ class Ledger:
             column = self._tasks.get(hop.task)
             if column is None or hop.task not in apart:
                 continue
-            column += len(self._tasks) * self._is_second(cycle, hop.task, hop.node)
+            if not shadow:
+                column += len(self._tasks) * self._is_second(cycle, hop.task, hop.node)
             ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
             if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
                 continue
@@ -733,7 +737,7 @@ class Ledger:
             # A shadow's last messages arrive at a sink whose job never runs.
             if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
                 known["ready_ns"][row, column] = max(ready_ns, 0)
-            self._enter_arrivals(known, row, cycle, hop, hops)
+            self._enter_arrivals(known, row, cycle, hop, () if shadow else hops)
 
     def _enter_arrivals(
         self,
@@ -743,10 +747,13 @@ class Ledger:
         hop: Hop,
         hops: Sequence[Hop],
     ) -> None:
-        """Enter the instants of the messages that reached a job; `hops` are the senders' jobs."""
+        """Enter the instants of the messages that reached a job.
+
+        `hops` are the senders' jobs, none for a shadow, which has one copy.
+        """
         for source, arrived_ns in hop.inputs:
             flow = self._flows.get((source, hop.task))
-            if flow is not None and self._copies > 1:
+            if flow is not None and self._copies > 1 and hops:
                 sender = self._sender(cycle, _by_site(hops), hop, source)
                 ends = [one for one in (sender, hop) if one is not None]
                 is_second = any(self._is_second(cycle, one.task, one.node) for one in ends)
@@ -797,7 +804,8 @@ class Ledger:
         for copy, after_ns in zip(placed.copies, held_ns, strict=True):
             flows = (flow for flow in self._forward if not self._is_shared(placed, flow))
             columns = [self._flow_column(cycle, flow, copy) for flow in flows]
-            if cycle.latency_ns > after_ns and (arrived[columns] < 0).all() and not cycle.deaf:
+            heard = self.complete(cycle) and not cycle.deaf
+            if heard and cycle.latency_ns > after_ns and (arrived[columns] < 0).all():
                 self._mark_lost(known, row, cycle, copy)
 
     def _is_shared(self, placed: Replicas, flow: Flow) -> bool:

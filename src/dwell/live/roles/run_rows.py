@@ -166,6 +166,7 @@ class RunRows:
         self._deadline_ns = problem.pipeline.deadline_ns
         self._sends_shadows = sends_shadows(controller)
         self._weighs_age = problem.objective.weighs_age
+        self._has_prices = problem.fabric.has_prices
         self._jobs = resume.jobs
         self._columns = columns_of(controller, jobs=resume.jobs)
         #: Row of the next cycle, and the last cycle that is known to be complete.
@@ -310,6 +311,8 @@ class RunRows:
             **{f"u_{name}": _known(share) for name, share in zip(names, busy, strict=True)},
             "cost": cost,
             **({"seen_age_ms": seen_age_ms} if self._weighs_age else {}),
+            # Only the simulator measures prices.
+            **({"seen_price_per_hour": None} if self._has_prices else {}),
             **self.ages.values(cycles, known),
             "overtaken": sum(cycle.overtaken for cycle in cycles),
             "term": cycles[-1].term,
