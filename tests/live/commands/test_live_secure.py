@@ -305,7 +305,6 @@ def test_certificates_are_renewed_while_the_cell_runs(cell: SecureCell) -> None:
     assert code == 0, error
     for name in ("R1", "R2", "controller", "operator", "E"):
         shutil.copytree(cell.keys / name, cell.host / name, dirs_exist_ok=True)
-        time.sleep(1)
 
     def renewed(status: dict[str, Any]) -> bool:
         certificates = status["certificates"]

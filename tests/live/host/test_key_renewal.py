@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from random import Random
 
 import pytest
 
@@ -17,8 +18,10 @@ from dwell.live.trust.keyring import Keyring
 from dwell.live.trust.request import request_certificate
 from dwell.live.trust.roster import write_private
 from dwell.live.trust.signing import Seals
-from dwell.live.wire.messages import Beat
-from dwell.live.wire.transport import Transport
+from dwell.live.wire import channels
+from dwell.live.wire.keys import CONTROLLER
+from dwell.live.wire.messages import Beat, Beats
+from dwell.live.wire.transport import Arrival, Transport
 from dwell.model import Problem
 from dwell.model.document import digests
 from tests.live.memory_transport import Network
@@ -42,22 +45,30 @@ class Role:
 
 
 class Host:
-    """A node's host, with its keyring and a copy of that; time jumps from look to look."""
+    """Host of a node, or of the controller, with its keyring; time jumps between its checks.
 
-    def __init__(self, problem: Problem, authority: Authority, folder: Path, node: str) -> None:
-        self.authority, self.node, self.source = authority, node, folder / node
-        self.problem, self.copy = problem, folder / f"{node}.copy"
+    The agent of a node has a copy of the keyring for its processes.
+    """
+
+    def __init__(self, problem: Problem, authority: Authority, folder: Path, name: str) -> None:
+        self.authority, self.name, self.source = authority, name, folder / name
+        self.problem, self.copy = problem, folder / f"{name}.copy"
+        self.controls = name == CONTROLLER
+        self.node = problem.controller_node if self.controls else name
         self.fetch()
-        used = installed(Keyring.open(self.source), self.copy)
+        used = Keyring.open(self.source)
+        if not self.controls:
+            used = installed(used, self.copy)
         self.network = Network()
-        who = f"agent@{node}"
-        transport = self.network.transport(who, node)
-        self.place = RolePlace(problem, who, node, transport, seals=Seals(used))
+        who = f"{CONTROLLER if self.controls else 'agent'}@{self.node}"
+        transport = self.network.transport(who, self.node)
+        self.place = RolePlace(problem, who, self.node, transport, seals=Seals(used))
         role = Role(self.place)
         self.pulse = role.pulse
         hosted = Hosted(role, transport, lambda: 0)
         self.connected: list[Keyring] = []
-        self.renewal = KeyRenewal(self.source, hosted, self.pulse, self.connect, copy=self.copy)
+        copy = None if self.controls else self.copy
+        self.renewal = KeyRenewal(self.source, hosted, self.pulse, self.connect, copy=copy)
 
     def connect(self, keyring: Keyring) -> Transport:
         self.connected.append(keyring)
@@ -66,7 +77,7 @@ class Host:
     def fetch(self, *names: str) -> None:
         """Take files from the authority's folder."""
         self.source.mkdir(mode=0o700, exist_ok=True, parents=True)
-        for path in (self.authority.folder / self.node).iterdir():
+        for path in (self.authority.folder / self.name).iterdir():
             if not names or path.name in names:
                 shutil.copy(path, self.source)
 
@@ -82,10 +93,19 @@ class Host:
         self.renewal._looked -= 1
         self.renewal.step()
         used = self.place.seals.keyring
-        # Whatever is started now reads the same.
-        read = Keyring.open(self.copy)
-        assert (read.own, read.roster) == (used.own, used.roster)
+        if not self.controls:
+            # Whatever is started now reads the same.
+            read = Keyring.open(self.copy)
+            assert (read.own, read.roster) == (used.own, used.roster)
         return used.own.generation, used.roster.number
+
+    def beat(self, others: list[Host], now_ns: int) -> None:
+        """Send a beat by the relay; hosts whose roster lacks the certificate reject it."""
+        beats = Beats((self.pulse.made(now_ns),))
+        key = self.place.keys.detour(self.place.keys.of(channels.BEATS, self.node))
+        sample = Arrival(key, self.place.sealed(channels.BEATS, beats))
+        for other in others:
+            other.pulse.receive(sample, now_ns)
 
 
 @pytest.fixture
@@ -171,6 +191,56 @@ def test_two_hosts_that_wait_for_each_other_both_get_there(
         other.hear("R2", number)
         other.hear(one.node, number)
     assert [one.uses() for one in hosts] == [(2, number), (2, number)]
+
+
+def test_a_controller_uses_a_newer_roster_while_its_certificate_waits(
+    problem: Problem, authority: Authority, tmp_path: Path
+) -> None:
+    """A node may use its new certificate before; without the roster its beats are rejected."""
+    host = Host(problem, authority, tmp_path, CONTROLLER)
+    for name in ("R1", CONTROLLER):
+        authority.issue(name)
+    number = authority.roster.number
+    certificate = (host.source / "cert.pem").read_bytes()
+    host.fetch()
+    assert host.uses() == (1, number)
+    assert host.connected[-1].files["cert.pem"] == certificate
+    for node in problem.fabric.nodes:
+        host.hear(node, number)
+    assert host.uses() == (2, number)
+
+
+@pytest.mark.parametrize("first", range(4))
+@pytest.mark.parametrize("pace", [1, 5, 100])
+def test_files_copied_in_any_order_and_pace_end_in_the_new_keys(
+    problem: Problem, authority: Authority, tmp_path: Path, pace: int, first: int
+) -> None:
+    """Hosts check in turn, after `pace` writes of half files; then each checks thrice."""
+    names = (*problem.fabric.nodes, CONTROLLER)
+    hosts = [Host(problem, authority, tmp_path, name) for name in names]
+    for name in ("R1", CONTROLLER):
+        authority.issue(name)
+    random, writes = Random(first), list[tuple[Path, bytes]]()
+    for host in random.sample(hosts, len(hosts)):
+        files = sorted((authority.folder / host.name).iterdir())
+        for file in random.sample(files, len(files)):
+            content, path = file.read_bytes(), host.source / file.name
+            writes += [(path, content[: len(content) // 2]), (path, content)]
+    checks, turn = 3 * len(hosts), first
+    while checks:
+        for path, content in writes[:pace]:
+            path.write_bytes(content)
+        checks -= not writes
+        del writes[:pace]
+        host = hosts[turn % len(hosts)]
+        host.uses()
+        turn += 1
+        for host in hosts:
+            if not host.controls:
+                host.beat(hosts, turn)
+    newest = authority.roster.number
+    found = {host.name: host.uses() for host in hosts}
+    assert found == {name: (authority.roster.subjects[name].generation, newest) for name in names}
 
 
 def test_files_that_are_copied_one_by_one_are_used_when_all_are_there(

@@ -522,7 +522,7 @@ def test_states_are_asked_for_by_the_controller(problem: Problem, seals: dict[st
     asked = encode(Snapshot(9, "planning", "R2", "E", 1, 1))
     for data in (asked, seals["E"].seal("snapshot", asked)):
         worker.receive(Arrival(key, data), world.network.now_ns)
-        assert worker.transfer.asked is None
+        assert not worker.transfer.asked
     # And by orders the state moves as ever.
     world.pin("SO")
     world.run(1_500)

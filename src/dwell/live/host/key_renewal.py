@@ -1,8 +1,9 @@
 """Key renewal: replaces the keys of a running cell by newer keys from a keyring.
 
-A new roster is used at once. A new certificate of this node waits until all other agents use a
-roster that lists it, so hosts may get their files in any order. The processes of a node read a copy
-of its keyring in the state folder, which is always valid.
+A new roster is used at once, also by the controller: it would reject beats under certificates that
+its roster lacks. A new certificate of this host waits until all other agents use a roster that
+lists it, so hosts may get their files in any order. The processes of a node read a copy of its
+keyring in the state folder, which is always valid.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ class KeyRenewal:
             return None
         if self._copy is not None:
             return installed(new, self._copy, whole=whole)
-        return new if whole or not changes else None
+        return new if whole or not changes else own.with_roster(new)
 
     def _may_use(self, new: Keyring, own: Keyring) -> bool:
         place = self._place
@@ -103,12 +104,12 @@ def installed(source: Keyring, copy: Path, *, whole: bool = False) -> Keyring:
     Raises a TrustError if the copy cannot be written.
     """
     make_private_folder(copy)
-    write_private(copy / "roster.json", (source.folder / "roster.json").read_bytes())
+    write_private(copy / "roster.json", source.files["roster.json"])
     if not whole:
         with suppress(TrustError):
             return Keyring.open(copy, cell=source.roster.cell)
     # Write the certificate last: the name of the key file depends on it.
-    write_private(copy / "ca.pem", (source.folder / "ca.pem").read_bytes())
-    write_private(own_key_file(copy, source.own.key), source.key_file.read_bytes())
-    write_private(copy / "cert.pem", (source.folder / "cert.pem").read_bytes())
+    write_private(copy / "ca.pem", source.files["ca.pem"])
+    write_private(own_key_file(copy, source.own.key), source.files["key.pem"])
+    write_private(copy / "cert.pem", source.files["cert.pem"])
     return Keyring.open(copy, cell=source.roster.cell)

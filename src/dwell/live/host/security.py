@@ -203,8 +203,7 @@ def _tls(problem: Problem, keyring: Keyring) -> dict[str, object]:
 
     # Pass contents: Zenoh would read files at every connection, when they may have changed.
     authority, certificate, key = (
-        base64.b64encode(path.read_bytes()).decode()
-        for path in (keyring.folder / "ca.pem", keyring.folder / "cert.pem", keyring.key_file)
+        base64.b64encode(keyring.files[name]).decode() for name in ("ca.pem", "cert.pem", "key.pem")
     )
     tls = "transport/link/tls"
     may_put = subjects(problem, keyring.roster)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import stat
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from cryptography.x509.oid import NameOID
 
 from dwell.errors import TrustError
 from dwell.live.trust.request import key_file
-from dwell.live.trust.roster import Roster, Subject
+from dwell.live.trust.roster import Roster, Subject, roster_content
 
 #: Remaining days of a certificate below which Dwell warns.
 SOON_DAYS = 30
@@ -26,13 +27,15 @@ class Keyring:
     """A subject's key and certificate, and the roster.
 
     `folder` contains ``ca.pem``, ``cert.pem``, ``roster.json`` and the key (see `key_file`).
+    `files` has their contents when they were read, by name; the key is ``key.pem``. A user may
+    replace the files at any time.
     """
 
     folder: Path
     own: Subject
     roster: Roster
     expires: datetime
-    key_file: Path
+    files: Mapping[str, bytes] = field(repr=False)
     _key: Ed25519PrivateKey = field(repr=False)
 
     @classmethod
@@ -42,11 +45,11 @@ class Keyring:
         Raises a TrustError if a file is missing, damaged or readable by other users, or if the
         certificate is revoked, expired, or belongs to another cell.
         """
-        authority, certificate, key, path = _read(folder)
+        authority, certificate, key, files = _read(folder)
         public = authority.public_key()
         if not isinstance(public, Ed25519PublicKey):
             raise TrustError(f"{folder / 'ca.pem'}: has no Ed25519 key")
-        roster = Roster.read(folder / "roster.json", public)
+        roster = Roster.decode(files["roster.json"], folder / "roster.json", public)
         if cell is not None and roster.cell != cell:
             raise TrustError(f"{folder}: keys of cell {roster.cell!r}, not of {cell!r}")
         try:
@@ -54,7 +57,8 @@ class Keyring:
         except (InvalidSignature, ValueError, TypeError):
             raise TrustError(f"{folder / 'cert.pem'}: was not issued by ca.pem") from None
         if key.public_key() != certificate.public_key():
-            raise TrustError(f"{folder}: {path.name} does not belong to cert.pem")
+            name = key_file(folder, certificate.public_key()).name
+            raise TrustError(f"{folder}: {name} does not belong to cert.pem")
         common = str(certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
         known = roster.of(common.rpartition(".")[0])
         if certificate.serial_number in roster.revoked or not known:
@@ -71,7 +75,12 @@ class Keyring:
                 f"{folder}: the certificate of {common} has expired on {expires:%Y-%m-%d}; "
                 "issue another with dwell keys issue"
             )
-        return cls(folder, own, roster, expires, path, key)
+        return cls(folder, own, roster, expires, files, key)
+
+    def with_roster(self, other: Keyring) -> Keyring:
+        """Return these keys with the roster of another keyring of the same authority."""
+        files = {**self.files, "roster.json": other.files["roster.json"]}
+        return replace(self, roster=other.roster, files=files)
 
     def warning(self, now: datetime | None = None) -> str:
         """Return a warning if the certificate expires soon, else an empty text."""
@@ -88,17 +97,21 @@ class Keyring:
         return self._key.sign(domain + b"\0" + data)
 
 
-def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519PrivateKey, Path]:
+def _read(
+    folder: Path,
+) -> tuple[x509.Certificate, x509.Certificate, Ed25519PrivateKey, dict[str, bytes]]:
     try:
-        authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
-        certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
+        files = {name: (folder / name).read_bytes() for name in ("ca.pem", "cert.pem")}
+        authority = x509.load_pem_x509_certificate(files["ca.pem"])
+        certificate = x509.load_pem_x509_certificate(files["cert.pem"])
         path = key_file(folder, certificate.public_key())
         mode = path.stat().st_mode
         if mode & (stat.S_IRWXG | stat.S_IRWXO):
             raise TrustError(
                 f"{path}: others may use it (mode {stat.S_IMODE(mode):o}); chmod 600 it"
             )
-        key = load_pem_private_key(path.read_bytes(), password=None)
+        files["key.pem"] = path.read_bytes()
+        key = load_pem_private_key(files["key.pem"], password=None)
     except OSError as error:
         raise TrustError(f"{error.filename}: cannot be read ({error.strerror})") from None
     except (ValueError, TypeError) as error:
@@ -107,4 +120,5 @@ def _read(folder: Path) -> tuple[x509.Certificate, x509.Certificate, Ed25519Priv
         raise TrustError(f"{folder}: a key or certificate is damaged ({error})") from None
     if not isinstance(key, Ed25519PrivateKey):
         raise TrustError(f"{path}: is no Ed25519 key")
-    return authority, certificate, key, path
+    files["roster.json"] = roster_content(folder / "roster.json")
+    return authority, certificate, key, files

@@ -141,18 +141,19 @@ class Roster:
 
         Raises a TrustError if it is missing or invalid, or the authority has not signed it.
         """
+        return cls.decode(roster_content(path), path, authority)
+
+    @classmethod
+    def decode(cls, content: bytes, path: Path, authority: Ed25519PublicKey) -> Roster:
+        """Decode the content of a file `path`, and verify the signature (see `read`)."""
         try:
-            if path.stat().st_size > MAX_BYTES:
-                raise TrustError(f"{path}: {path.stat().st_size} bytes are too many for a roster")
-            document = json.loads(path.read_text(encoding="utf-8"))
+            document = json.loads(content.decode("utf-8"))
             signature = base64.b64decode(document.pop("signature"), validate=True)
             authority.verify(signature, DOMAIN + _canonical(document))
             if document["dwell"] != VERSION:
                 raise TrustError(f"{path}: a roster of version {document['dwell']}, not {VERSION}")
             subjects = [Subject(**entry) for entry in document["subjects"]]
             cell, number, revoked = (document[key] for key in ("cell", "number", "revoked"))
-        except OSError as error:
-            raise TrustError(f"{path}: cannot be read ({error.strerror})") from None
         except InvalidSignature:
             raise TrustError(f"{path}: was not signed by the authority of ca.pem") from None
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -162,6 +163,18 @@ class Roster:
         newest = {subject.name: subject for subject in subjects}
         earlier = tuple(one for one in subjects if one is not newest[one.name])
         return cls(cell, number, newest, tuple(revoked), earlier)
+
+
+def roster_content(path: Path) -> bytes:
+    """Read the file of a roster; raises a TrustError if it is missing or too long."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise TrustError(f"{path}: cannot be read ({error.strerror})") from None
+    if len(content) > MAX_BYTES:
+        raise TrustError(f"{path}: more than {MAX_BYTES} bytes are too many for a roster")
+    return content
 
 
 def _canonical(document: Mapping[str, Any]) -> bytes:
