@@ -139,6 +139,7 @@ controller:
   estimator: corrected
   shadow_fraction: 0.1
   half_life_windows: 3
+  replicate: {base: latency-first}
   migration: cold
   guard_cycles: 4
   probe_cycles: 20
@@ -173,7 +174,7 @@ DECISION = {
     "objective": {"weights", "targets", "caps", "tiers"},
     "controller": {
         *("policy", "estimator", "min_improvement", "min_dwell", "min_dwell_cycles"),
-        *("decide_cycles", "shadow_fraction", "escape", "half_life_windows"),
+        *("decide_cycles", "shadow_fraction", "escape", "half_life_windows", "replicate"),
     },
     "live": {"mode", "observer"},
 }

@@ -19,7 +19,6 @@ from dwell.errors import ExitCode, Fault, PolicyError, ProblemError
 from dwell.model.bounds import counted
 from dwell.model.controller_settings import AUTO
 from dwell.model.entry_points import WARNINGS, added, added_name
-from dwell.model.shadow_plan import alternatives
 
 if TYPE_CHECKING:
     from dwell.estimators.prices import Price
@@ -242,6 +241,8 @@ def _shadow_notes(
     problem: Problem, tried: Mapping[str, Sequence[ShadowPrice]], fractions: Mapping[str, float]
 ) -> Iterator[str]:
     """Yield the shares of shadows, and why they are not larger."""
+    from dwell.model.shadow_plan import alternatives
+
     # Replicas whose members are the only other candidates send no shadows.
     idle = {
         name
