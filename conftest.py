@@ -47,6 +47,7 @@ WITH_PRIORITY: Chosen = {
     "tests/live/test_real_faults.py": (),
     "lab/tests/chaos/test_fault_campaign.py": ("loopback", "test_every", "test_a_campaign"),
     "lab/tests/chaos/test_strike.py": (),
+    "tests/test_two_computers.py": (),
 }
 
 #: Real processes that have to keep to shares of the machine.
@@ -70,7 +71,6 @@ TOGETHER = {
         "lab/tests/commands/test_testbed.py",
         "lab/tests/testbed/test_netns_testbed.py",
         "lab/tests/testbed/test_run.py",
-        "tests/test_two_computers.py",
     ),
     "packages": ("tests/test_package.py",),
 }
