@@ -73,7 +73,7 @@ BESIDE := -n auto --no-loadscope-reorder
 # pytest ends with 5 where ARGS leave nothing to run.
 define run_tests
 	@mkdir -p build; ok() { "$$@" || [ $$? -eq 5 ]; }; \
-	ok nice -n -10 $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS) \
+	ok nice -n -5 $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS) \
 		>build/with_priority.txt 2>&1 & prior=$$!; \
 	ok nice -n 10 $(TESTS) $(BESIDE) -m "$(1)not alone and not with_priority" $(ARGS); beside=$$?; \
 	wait $$prior; prior=$$?; cat build/with_priority.txt; \
