@@ -67,13 +67,12 @@ demo: env ## Simulate and report an example into demo-out/ (REAL=path: on a real
 TESTS := $(BIN)/python -m pytest
 BESIDE := -n auto --no-loadscope-reorder
 # Runs all tests that the marks in $(1) leave. Real processes that keep a period run next to the
-# others, with a higher priority (where the user may set it); tests that need the machine to
-# themselves follow. Each part keeps its failures in a folder of its own, so that none overwrites
-# those of another.
+# others, which have a lower priority; tests that need the machine to themselves follow. Each part
+# keeps its failures in a folder of its own, so that none overwrites those of another.
 # pytest ends with 5 where ARGS leave nothing to run.
 define run_tests
 	@mkdir -p build; ok() { "$$@" || [ $$? -eq 5 ]; }; \
-	ok nice -n -5 $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS) \
+	ok $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS) \
 		>build/with_priority.txt 2>&1 & prior=$$!; \
 	ok nice -n 10 $(TESTS) $(BESIDE) -m "$(1)not alone and not with_priority" $(ARGS); beside=$$?; \
 	wait $$prior; prior=$$?; cat build/with_priority.txt; \
