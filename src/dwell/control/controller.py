@@ -337,8 +337,9 @@ class Controller:
         """Return L95 known at the end of the window (ms), V_D, and L95 for caps (ms)."""
         age_ns = window.close_ns - window.release_ns
         missed = int(missed_cycles(window.latency_ns, age_ns, self._deadline_ns, window.over_age))
-        l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
-        if window.ages_ns is not None:
+        if window.ages_ns is None:
+            l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
+        else:
             uncut_ms = age_l95_ms(window.ages_ns[None])[0]
             l95_ms = np.minimum(uncut_ms, round(self._censor_ms * 1e6) / 1e6)
         return float(l95_ms), missed / len(age_ns), float(uncut_ms)

@@ -165,6 +165,11 @@ def nodes_of(nodes: Nodes) -> tuple[str, ...]:
     return nodes if isinstance(nodes, tuple) else (nodes,)
 
 
+def plain_candidates(candidates: Mapping[str, Placement]) -> dict[str, Placement]:
+    """Return the candidates with one copy of each cycle."""
+    return {name: one for name, one in candidates.items() if one.second is None}
+
+
 def written_nodes(nodes: Nodes) -> str:
     """Return the nodes of a task as text: ``E``, or ``R1 + E`` for two copies."""
     return " + ".join(nodes_of(nodes))

@@ -20,7 +20,7 @@ from dwell.model.instants import require_length
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
-from dwell.model.placement import Placement, Replicas
+from dwell.model.placement import Placement, Replicas, plain_candidates
 from dwell.model.replicated import Replicated
 from dwell.model.scenario import Scenario
 from dwell.model.semantics import CellParts, find_faults, nearest_of
@@ -217,7 +217,7 @@ class Problem(Displayed):
     @property
     def plain_candidates(self) -> dict[str, Placement]:
         """The candidates with one copy of each cycle."""
-        return {name: one for name, one in self.candidates.items() if one.second is None}
+        return plain_candidates(self.candidates)
 
     def at_phase(self, phase_ms: float | None) -> Problem:
         """Return the problem with another offset of all its releases."""

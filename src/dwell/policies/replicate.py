@@ -26,7 +26,7 @@ from dwell.errors import PolicyError
 from dwell.model.bounds import MIN_DWELL, MIN_IMPROVEMENT
 from dwell.model.controller_settings import REPLICATE
 from dwell.model.objective import Objective
-from dwell.model.placement import Placement, Replicas
+from dwell.model.placement import Placement, Replicas, plain_candidates
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.dtp import DTP, cheapest
@@ -84,7 +84,7 @@ class Replicate(PricingPolicy):
         super().__init__(candidates=candidates, initial=initial, objective=objective)
         if base is None:
             base = DTP(
-                candidates=_singles(self.candidates),
+                candidates=plain_candidates(self.candidates),
                 initial=self.single,
                 objective=objective,
                 min_dwell=min_dwell,
@@ -158,14 +158,13 @@ class Replicate(PricingPolicy):
         costs = pricing.estimated(estimates, now)
         # A pair in force has no metrics of its members.
         seen = observed if now == self.single else estimates[self.single]
-        singles = {name: estimates[name] for name in _singles(self.candidates)}
+        singles = {name: estimates[name] for name in plain_candidates(self.candidates)}
         choice, after = self._base.propose(observed=seen, estimates=singles, tentative=True)
         made = choice if isinstance(choice, Decision) else None
         single = check_name("the base's decision", made.name if made else str(choice), singles)
         chosen = _Chosen(single, after)
         pairs = [name for name in self.candidates if self._is_pair(name, single)]
-        stays = now == single or now in pairs
-        if stays and self._standing.dwell < self.min_dwell:
+        if now in (single, *pairs) and self._standing.dwell < self.min_dwell:
             return self._stay("dwell", costs), chosen
         eligible, within_caps = pricing.eligible(estimates)
         pairs = [name for name in pairs if name in eligible]
@@ -211,11 +210,6 @@ class Replicate(PricingPolicy):
         if pair == self.incumbent:
             return observed.violation_rate < LATE and not exceeds(-gain, least)
         return estimates[pair].violation_rate < LATE and exceeds(gain, least)
-
-
-def _singles(candidates: Mapping[str, Placement]) -> dict[str, Placement]:
-    """Return the candidates with one copy."""
-    return {name: one for name, one in candidates.items() if one.second is None}
 
 
 def _member(candidates: Mapping[str, Placement], name: str, preferred: str = "") -> str:
