@@ -15,7 +15,7 @@ from dwell.live.wire import channels
 from dwell.live.wire.messages import State, decode
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
-from tests.live.rated_cells import SLOW, rated, world_of
+from tests.live.rated_cells import SLOW, document, rated, world_of
 from tests.live.replayed import SYNCHRONOUS, Clocks, messages_of, recorded, replay, simulate
 from tests.live.small_world import Counting, Staying, canonical, columns
 
@@ -121,6 +121,20 @@ def test_a_slow_source_guesses_a_stamp_that_was_lost() -> None:
     world.run(SLOW * 10)
     world.network.heal(cut)
     world.run(500)
+    assert steps([cycle for cycle, _ in world.arms["arm"].applied]) == {SLOW}
+
+
+def test_a_source_that_moves_is_proven_by_its_shadows() -> None:
+    tasks = document()["tasks"]
+    tasks["lidar"]["on"] = tasks["fuse"]["on"]
+    nodes = {"LOC": "R", "EDGE": "E"}
+    candidates = {name: {"fuse": node, "lidar": node} for name, node in nodes.items()}
+    problem = rated(tasks=tasks, candidates=candidates, controller=GUARDED | {"probe_cycles": 4})
+    world = world_of(problem, policy="EDGE")
+    world.run(300)
+    world.move_by_guard("LOC")
+    world.run(1_500)
+    assert world.stamper.placement == "EDGE"
     assert steps([cycle for cycle, _ in world.arms["arm"].applied]) == {SLOW}
 
 

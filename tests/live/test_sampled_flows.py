@@ -377,3 +377,18 @@ def test_only_old_nodes_of_a_sampling_task_may_forward_values() -> None:
     }
     may_send = dict(senders(sampling(waited=False), "in"))
     assert may_send["control", "E", "main"] == ["E", "R"]
+
+
+def test_a_task_with_sampled_inputs_alone_is_proven_by_its_shadows() -> None:
+    controller = {"on": "E", "initial": "AWAY", "fallbacks": ["LOC"], "probe_cycles": 10}
+    world, log = logged(sampling(waited=False, controller=controller), policy="AWAY")
+    world.run(300)
+    world.move_by_guard("LOC")
+    begun = len(log.inputs)
+    world.run(8 * P_MS)
+    assert world.stamper.placement == "LOC"
+    # One job per cycle, and one of its shadow: the worker on the other node runs no job itself.
+    assert len(log.inputs) - begun <= 16
+    world.run(1_000)
+    assert world.stamper.placement == "AWAY"
+    assert {later - earlier for earlier, later in pairwise(world.cycles)} == {1}

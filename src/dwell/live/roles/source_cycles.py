@@ -17,16 +17,24 @@ class SourceCycles:
 
     If the source's node is not the stamper's, stamps arrive one cycle early. If a stamp is missing
     and cycles are released by a timer, the source guesses stamps for up to g cycles, at least one.
-    `offset_ns` returns the time from the release of a cycle to its begin here.
+    `offset_ns` returns the time from the release of a cycle to its begin here. Cycles of a `shadow`
+    worker are shadows, which are never guessed.
     """
 
     def __init__(
-        self, place: RolePlace, offsets: Offsets, rate: int, offset_ns: Callable[[Stamp], int]
+        self,
+        place: RolePlace,
+        offsets: Offsets,
+        rate: int,
+        offset_ns: Callable[[Stamp], int],
+        *,
+        shadow: bool,
     ) -> None:
         self._place, self._offsets, self._offset_ns = place, offsets, offset_ns
-        self._rate = rate
+        self._rate, self._shadow = rate, shadow
         self._guesses = max(place.problem.controller.guard_cycles // rate, 1)
-        self._alone = place.node != place.stamper[0] and place.problem.live.release == "timer"
+        timed = place.problem.live.release == "timer"
+        self._alone = place.node != place.stamper[0] and timed and not shadow
         self._waiting: dict[tuple[int, int], tuple[Header, int]] = {}
         self._last: Header | None = None
         self._guessed = 0
@@ -80,4 +88,4 @@ class SourceCycles:
         else:
             return None
         self._last = header
-        return Job(header, {STAMPER: (header, b"", at_ns)}, False)
+        return Job(header, {STAMPER: (header, b"", at_ns)}, self._shadow)

@@ -116,7 +116,9 @@ class Worker:
             return max(offset_ns, self.routes.begins_ns(task, place.node, stamp))
 
         self._source = (
-            SourceCycles(place, self.offsets, rate, begins_ns) if STAMPER in sources else None
+            SourceCycles(place, self.offsets, rate, begins_ns, shadow=shadow)
+            if STAMPER in sources
+            else None
         )
         #: Cycles with two copies.
         self.copies = ReplicatedCycles(problem)
@@ -199,7 +201,8 @@ class Worker:
         if header.stamp.term:  # not a source's guess
             self.transfer.stamped(header.stamp.key)
         if header.source == STAMPER and self._source is not None:
-            if not self.copies.is_done(header.stamp):
+            # A worker that samples hears the stamps of shadows, too.
+            if (kind == SHADOW) == self.shadow and not self.copies.is_done(header.stamp):
                 self._source.stamped(header, now_ns)
             return
         sampled = header.source in self.samples.sources
