@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import sys
 import tempfile
 from importlib.metadata import PackageNotFoundError, distribution
@@ -14,6 +15,7 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import ROOT, run_timed
 
 MB = 1e6
+BUILD = (sys.executable, "-m", "hatchling", "build", "-t")
 
 
 def measure(quick: bool) -> Section:
@@ -21,21 +23,27 @@ def measure(quick: bool) -> Section:
     figures = [Figure("installed with [sim], Dwell aside", [_installed({"sim"}) / MB], "MB")]
     notes = []
     with tempfile.TemporaryDirectory() as folder:
-        copy = Path(folder, "dwell")
-        left_out = shutil.ignore_patterns(".*", "build", "runs", "studies", "demo-out", "*.so")
-        shutil.copytree(ROOT, copy, ignore=left_out)
-        command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel"]
+        source = unpack_source(Path(folder))
+        command = [*BUILD, "wheel"]
         spent = []
         for _ in range(1 if quick else 3):
-            shutil.rmtree(copy / "build", ignore_errors=True)
-            spent.append(run_timed(command, folder=copy)[1].cpu_s)
+            shutil.rmtree(source / "build", ignore_errors=True)
+            spent.append(run_timed(command, folder=source)[1].cpu_s)
         figures.append(
             Figure("building the kernel and a wheel, CPU time", spent, "s", Goal(high=10))
         )
-        (wheel,) = (copy / "dist").glob("*.whl")
+        (wheel,) = (source / "dist").glob("*.whl")
         figures.append(Figure("wheel", [wheel.stat().st_size / MB], "MB", Goal(high=1.5)))
         notes.append(wheel.name)
     return Section("Installing", figures, notes)
+
+
+def unpack_source(folder: Path) -> Path:
+    """Build the source distribution, unpack it in a folder, and return its tree."""
+    subprocess.run([*BUILD, "sdist", "-d", folder], cwd=ROOT, check=True, capture_output=True)
+    (archive,) = folder.glob("dwell_placement-*.tar.gz")
+    shutil.unpack_archive(archive, folder, filter="data")
+    return folder / archive.name.removesuffix(".tar.gz")
 
 
 def _installed(extras: set[str]) -> int:

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 import dwell
+from benchmarks.size import unpack_source
 from dwell.kernels.library import load
 from dwell.kernels.library_file import NAME
 from tests.cli.live_cell import RealCell
@@ -27,11 +28,7 @@ ROOT = Path(__file__).parents[1]
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder that holds what the source distribution holds."""
-    folder = tmp_path_factory.mktemp("sdist")
-    build("sdist", ROOT, folder)
-    (archive,) = folder.glob("dwell_placement-*.tar.gz")
-    shutil.unpack_archive(archive, folder, filter="data")
-    return folder / archive.name.removesuffix(".tar.gz")
+    return unpack_source(tmp_path_factory.mktemp("sdist"))
 
 
 @pytest.fixture(scope="module")
