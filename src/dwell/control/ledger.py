@@ -377,7 +377,7 @@ class FleetLedger:
         """Permit any move of a cell outside Φ that adds no task to a shared node."""
         candidates, here = self.cells[index].problem.candidates, self.placements[index]
         before, after = candidates[here], candidates[decision.name]
-        if any(node in self.shared and before[task] != node for task, node in after.items()):
+        if any(node in self.shared for _, node in {*after.sites} - {*before.sites}):
             return Verdict(here, NOT_AS_PLAYED, (None, None, self.round))
         self.place(index, decision.name)
         return Verdict(decision.name, None, (None, None, self.round))

@@ -147,7 +147,7 @@ class FleetPrices:
 
     def meets(self, placement: Placement) -> bool:
         """Whether a placement uses a shared node."""
-        return not set(self.shared).isdisjoint(placement.values())
+        return not placement.nodes.isdisjoint(self.shared)
 
     def begin(self, presents: Sequence[Present], absent: Collection[int] = ()) -> None:
         """Begin with other measured conditions, one per cell.

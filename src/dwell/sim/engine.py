@@ -330,7 +330,7 @@ class SimulatedStamper:
         if plan is not None and controller.coordination is not None:
             self.turns = controller.coordination.turns(realisation.release_ns[:-1])
         placed = problem.candidates.values()
-        self.there = [i for i, one in enumerate(placed) if not set(shared).isdisjoint(one.values())]
+        self.there = [i for i, one in enumerate(placed) if not one.nodes.isdisjoint(shared)]
         #: Whether the guard wants probes in a run without a shadow.
         self.lacks_shadow = False
         self.course = controller.course

@@ -604,7 +604,7 @@ def _require_capacity(fleet: Fleet) -> None:
         faults.append(
             Fault("shared", "no node is shared, so that there may be any number of cells")
         )
-    elif not any(node in fleet.shared for one in used for node in one.values()):
+    elif all(one.nodes.isdisjoint(fleet.shared) for one in used):
         nodes = ", ".join(fleet.shared)
         message = f"{fleet.policy_of(first)} never uses a shared node ({nodes})"
         any_number = f"so that there may be any number of {first.cell.name}"
