@@ -83,8 +83,16 @@ class Host:
 
     def hear(self, node: str, roster: int) -> None:
         """Hear the agent of another node, which uses a roster."""
+        self._hear(f"agent@{node}", node, roster)
+
+    def hear_controller(self, roster: int) -> None:
+        """Hear the controller, which uses a roster."""
+        node = self.problem.controller_node
+        self._hear(f"{CONTROLLER}@{node}", node, roster)
+
+    def _hear(self, who: str, node: str, roster: int) -> None:
         cell = digests(self.problem)["wiring"]
-        beat = Beat(f"agent@{node}", node, 1, roster, True, cell=cell, roster=roster)
+        beat = Beat(who, node, 1, roster, True, cell=cell, roster=roster)
         assert self.pulse.detector.hear(beat, roster)
 
     def uses(self) -> tuple[int, int]:
@@ -101,9 +109,14 @@ class Host:
 
     def beat(self, others: list[Host], now_ns: int) -> None:
         """Send a beat by the relay; hosts whose roster lacks the certificate reject it."""
-        beats = Beats((self.pulse.made(now_ns),))
-        key = self.place.keys.detour(self.place.keys.of(channels.BEATS, self.node))
-        sample = Arrival(key, self.place.sealed(channels.BEATS, beats))
+        place, beat = self.place, self.pulse.made(now_ns)
+        if self.controls:
+            key = place.keys.of(channels.BEAT, self.node, place.who)
+            payload = place.sealed(channels.BEAT, beat)
+        else:
+            key = place.keys.of(channels.BEATS, self.node)
+            payload = place.sealed(channels.BEATS, Beats((beat,)))
+        sample = Arrival(place.keys.detour(key), payload)
         for other in others:
             other.pulse.receive(sample, now_ns)
 
@@ -156,6 +169,21 @@ def test_a_certificate_waits_until_all_agents_know_it(host: Host, authority: Aut
     host.hear("R2", number)
     assert host.uses() == (2, number)
     assert len(host.connected) == 2
+
+
+def test_a_certificate_waits_for_a_controller_that_is_there(
+    host: Host, authority: Authority
+) -> None:
+    before = authority.roster.number
+    authority.issue("R1")
+    number = authority.roster.number
+    host.fetch()
+    host.hear("E", number)
+    host.hear("R2", number)
+    host.hear_controller(before)
+    assert host.uses() == (1, number)
+    host.hear_controller(number)
+    assert host.uses() == (2, number)
 
 
 def test_a_node_that_is_off_delays_a_certificate_until_the_last_hour(
@@ -236,8 +264,10 @@ def test_files_copied_in_any_order_and_pace_end_in_the_new_keys(
         host.uses()
         turn += 1
         for host in hosts:
-            if not host.controls:
-                host.beat(hosts, turn)
+            host.beat(hosts, turn)
+        # No host uses a certificate that another host rejects.
+        keyrings = [host.place.seals.keyring for host in hosts if host.place.seals]
+        assert all(one.own in other.roster.certificates for one in keyrings for other in keyrings)
     newest = authority.roster.number
     found = {host.name: host.uses() for host in hosts}
     assert found == {name: (authority.roster.subjects[name].generation, newest) for name in names}

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dwell.errors import TrustError
+from dwell.live.host.agent import Agent
 from dwell.live.roles.role import RolePlace
 from dwell.live.trust import signing
 from dwell.live.trust.authority import Authority
@@ -138,6 +139,18 @@ def test_a_cell_with_keys_runs_as_one_without(problem: Problem, seals: dict[str,
             place = getattr(role, "place", None) or role.worker.place  # type: ignore[attr-defined]
             assert not place.complaints
     assert runs[0] == runs[1]
+
+
+def test_agents_hear_which_roster_each_agent_and_the_controller_use(
+    world: World, seals: dict[str, Seals]
+) -> None:
+    number = seals["R1"].keyring.roster.number
+    known = [role for role in roles(world.problem) if role.kind in ("agent", "controller")]
+    for node in NODES:
+        agent = world.roles[f"agent@{node}"]
+        assert isinstance(agent, Agent)
+        beats = [agent.pulse.detector.last(one.who) for one in known if one.who != agent.place.who]
+        assert [beat and beat.roster for beat in beats] == [number] * 3
 
 
 def test_every_small_message_that_matters_is_signed(

@@ -118,12 +118,13 @@ class Agent:
         self._busy_ns, self._accelerator = busy_ns, accelerator
         self.cpu_clock: Callable[[], int] = time.process_time_ns
         self._relays = place.node == place.problem.relay_node
-        # Beats of agents contain the number of their roster.
-        everybody = self._relays or place.seals is not None
+        # Beats contain the number of the sender's roster.
+        has_keys = place.seals is not None
         self.offsets = place.offsets()
         self.pulse = Pulse(
             *(place, self._state),
-            nodes=["*"] if everybody else self._senders(),
+            hears=[place.stamper, place.controller] if has_keys else None,
+            nodes=["*"] if self._relays or has_keys else self._senders(),
             offsets=self.offsets,
         )
         self._members = [

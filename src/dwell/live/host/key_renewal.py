@@ -1,9 +1,9 @@
 """Key renewal: replaces the keys of a running cell by newer keys from a keyring.
 
-A new roster is used at once, also by the controller: it would reject beats under certificates that
-its roster lacks. A new certificate of this host waits until all other agents use a roster that
-lists it, so hosts may get their files in any order. The processes of a node read a copy of its
-keyring in the state folder, which is always valid.
+A new roster is used at once. A new certificate of this host waits until all other agents, and the
+controller if there is one, use a roster that lists it: they reject messages under certificates that
+their roster lacks. So hosts may get their files in any order. The processes of a node read a copy
+of its keyring in the state folder, which is always valid.
 """
 
 from __future__ import annotations
@@ -90,9 +90,12 @@ class KeyRenewal:
         return new if whole or not changes else own.with_roster(new)
 
     def _may_use(self, new: Keyring, own: Keyring) -> bool:
-        place = self._place
+        place, last = self._place, self._pulse.detector.last
         agents = (r.who for r in roles(place.problem) if r.kind == "agent" and r.who != place.who)
-        beats = [self._pulse.detector.last(who) for who in agents]
+        beats = [last(who) for who in agents]
+        # A cell may run without a controller.
+        if (beat := last(place.controller[1])) is not None:
+            beats.append(beat)
         listed = all(beat and beat.roster >= new.roster.number for beat in beats)
         ends_soon = own.own.ends - datetime.now(UTC) < LAST
         return listed or ends_soon or own.own not in new.roster.certificates

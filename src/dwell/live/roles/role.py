@@ -159,6 +159,12 @@ class RolePlace:
         node = self.problem.stamper_node
         return node, f"stamper@{node}"
 
+    @property
+    def controller(self) -> tuple[str, str]:
+        """Node and name of the controller."""
+        node = self.problem.controller_node
+        return node, f"controller@{node}"
+
     def offsets(self) -> Offsets:
         """Return new offsets of the nodes' clocks from the clock of the stamper's node."""
         system = self.problem.live.clock == "system"
@@ -274,7 +280,7 @@ class RolePlace:
         channel = CHANNELS[self.keys.word(sample.key)]
         message: Beat | Beats = self._decoded(channel, sample)
         if isinstance(message, Beats):
-            beats, controller = message.beats, f"controller@{self.problem.controller_node}"
+            beats, controller = message.beats, self.controller[1]
             node = sample.key.rpartition("/")[2]
             good = beats[0].who == f"agent@{node}"
             good &= all(beat.node == node and beat.who != controller for beat in beats)
