@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pytest
 
-from dwell.model import Decision, Placement, Problem, QoS
+from dwell.model import Decision, Placement, Problem, QoS, evolve
 from dwell.policies import DTP, MinimalPolicy, Policy, by_name, check, check_policy
 from dwell.policies.registry import REGISTRY
 from tests.cells.paper import CANDIDATES, OBJECTIVE, place, problem
@@ -54,6 +54,20 @@ def only(faults: tuple[str, ...]) -> str:
 @pytest.mark.parametrize("name", [*REGISTRY, *CANDIDATES])
 def test_the_own_policies_are_sound(name: str) -> None:
     assert check_policy(by_name(name, problem()), problem()) == ()
+
+
+@pytest.mark.parametrize("name", REGISTRY)
+def test_the_own_policies_are_sound_with_ages_prices_and_capped_misses(name: str) -> None:
+    weighing = evolve(
+        problem(),
+        {
+            "links[0].price_per_gb": 0.1,
+            "objective.weights": {"age": 1, "price": 1},
+            "objective.targets": {"age_ms": 50, "price_per_hour": 1},
+            "objective.caps": {"latency_ms": 60, "misses": {"m": 1, "k": 20}},
+        },
+    )
+    assert check_policy(by_name(name, weighing), weighing) == ()
 
 
 def test_minimal_policies_are_sound() -> None:

@@ -249,7 +249,7 @@ def _situations(problem: Problem) -> Iterator[Situation]:
     caps = problem.objective.caps
 
     def qos(l95_ms: float, violation_rate: float, used: float) -> QoS:
-        return QoS(l95_ms, violation_rate, dict.fromkeys(problem.fabric.resources, used))
+        return _qos(problem, l95_ms, violation_rate, dict.fromkeys(problem.fabric.resources, used))
 
     def alike(l95_ms: float, violation_rate: float, used: float) -> tuple[Window, ...]:
         return (dict.fromkeys(names, qos(l95_ms, violation_rate, used)),) * SHORT
@@ -291,5 +291,18 @@ def _walk(problem: Problem, windows: int) -> Iterator[Window]:
                 used[name][one] = min(1.0, max(0.0, used[name][one] + rng.gauss(0, 0.1)))
             l95_ms = min(problem.pipeline.deadline_ms * math.exp(logs[name]), problem.censor_ms)
             rate = min(1.0, max(0.0, rng.gauss(0.3 * logs[name], 0.1)))
-            window[name] = QoS(l95_ms, rate, used[name])
+            window[name] = _qos(problem, l95_ms, rate, used[name])
         yield window
+
+
+def _qos(problem: Problem, l95_ms: float, rate: float, used: Mapping[str, float]) -> QoS:
+    """Return a QoS with a mean age, a price and a share of misses, if the objective has them."""
+    objective = problem.objective
+    return QoS(
+        l95_ms,
+        rate,
+        used,
+        age_ms=l95_ms if objective.weighs_age else None,
+        misses=rate if objective.caps.misses is not None else None,
+        price_per_hour=max(used.values()) if objective.weighs_price else None,
+    )
