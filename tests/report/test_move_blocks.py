@@ -7,12 +7,14 @@ from typing import Any
 import polars as pl
 import pytest
 
+from dwell.report.charts import Limit
 from dwell.report.figure import Figure, printed_svg, svg
 from dwell.report.move_blocks import move_blocks
 from dwell.report.palette import Palette
 from dwell.report.table import MOST_ROWS, Table, Text, table_text
 from dwell.study.predicted_moves import COLUMNS
 
+LIMIT = Limit(33.0, "deadline")
 PALETTE = Palette.of(("LOC", "SO", "HYB"))
 MOVE = {
     "window": 9,
@@ -37,7 +39,7 @@ def frame(*moves: dict[str, Any]) -> pl.DataFrame:
 
 
 def blocks(*moves: dict[str, Any]) -> tuple[Figure, Table]:
-    figure, table = move_blocks(frame(*moves), PALETTE, 33.0)
+    figure, table = move_blocks(frame(*moves), PALETTE, LIMIT)
     assert isinstance(figure, Figure)
     assert isinstance(table, Table)
     return figure, table
@@ -57,7 +59,7 @@ def rules(panel: dict[str, Any]) -> list[float]:
 
 
 def test_without_moves_nothing_is_shown() -> None:
-    assert move_blocks(frame(), PALETTE, 33.0) == []
+    assert move_blocks(frame(), PALETTE, LIMIT) == []
 
 
 def test_each_axis_has_the_range_of_its_values() -> None:
@@ -133,7 +135,7 @@ def test_long_tables_are_cut_and_say_so() -> None:
 def test_moves_of_several_runs_say_which() -> None:
     moves = frame({}, {}).with_columns(scenario=pl.Series(["calm", "storm"]), run=pl.lit("one"))
     scenario = Text("scenario", "", "scenario")
-    _, table = move_blocks(moves, PALETTE, 33.0, (Text("run", "run"),), scenario)
+    _, table = move_blocks(moves, PALETTE, LIMIT, (Text("run", "run"),), scenario)
     assert isinstance(table, Table)
     assert [heading for heading, _ in table.groups()] == ["Calm", "Storm"]
     assert table.headings[0] == "run"

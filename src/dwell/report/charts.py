@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from dwell.display import Measure
+    from dwell.model import Problem
 
 #: Names of the parts of a latency, and their colours by name.
 PARTS_SHOWN = {"compute": "computing", "queue": "waiting", "network": "network"}
@@ -52,6 +53,13 @@ class Limit(NamedTuple):
 
 
 NO_LIMIT = Limit(math.inf, "")
+
+
+def latency_limit(problem: Problem) -> Limit:
+    """Return the limit of L95 in J: D, or `max_age_ms` of the chain in ``objective.latency``."""
+    if (chain := problem.latency_chain) is not None:
+        return Limit(chain.max_age_ms, "age limit")
+    return Limit(problem.pipeline.deadline_ms, "deadline")
 
 
 def quantity(field: str, title: str | None, **more: Any) -> Spec:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -14,7 +15,15 @@ from dwell.model.bounds import counted
 from dwell.model.disturbed import Disturbed, disturbed
 from dwell.model.table_columns import SHARE_OF
 from dwell.report.capacity_page import PHASES
-from dwell.report.charts import coloured, disc, layer, name_of, names, quantity
+from dwell.report.charts import (
+    coloured,
+    disc,
+    latency_limit,
+    layer,
+    name_of,
+    names,
+    quantity,
+)
 from dwell.report.figure import Figure, Spec
 from dwell.report.formatting import percent, write_ms
 from dwell.report.page import Definitions, Fact, Page, Section
@@ -156,11 +165,11 @@ class _FleetPage:
     def _drawn_cells(self) -> Figure:
         import polars as pl
 
-        deadlines = {name: one.pipeline.deadline_ms for name, one in self.problems.items()}
         # Cells of several files have several deadlines.
+        tails = {name: latency_limit(one).value for name, one in self.problems.items()}
         limits = {
-            RATE: dict.fromkeys(deadlines, 100 * self.run.fleet.aim),
-            L95: deadlines,
+            RATE: dict.fromkeys(tails, 100 * self.run.fleet.aim),
+            L95: {name: limit for name, limit in tails.items() if math.isfinite(limit)},
             COST: {},
         }
         rows = [
@@ -181,7 +190,7 @@ class _FleetPage:
             {"rows": pl.DataFrame(rows, infer_schema_length=None)},
             lambda width: _dots(self.names, [one.heading for one in limits], width),
             f"Means over the windows after the warm-up. Dashed: the aim of {self.aim}, and the "
-            "deadline.",
+            "deadline or age limit.",
         )
 
     def _topologies(self) -> Iterator[Figure]:

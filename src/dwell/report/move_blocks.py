@@ -27,7 +27,7 @@ MARGIN = 0.06
 def move_blocks(
     moves: pl.DataFrame,
     palette: Palette,
-    deadline_ms: float,
+    limit: Limit,
     about: Sequence[Text] = (),
     group: Text | None = None,
 ) -> list[Figure | Table]:
@@ -38,10 +38,10 @@ def move_blocks(
     """
     if moves.is_empty():
         return []
-    return [_figure(moves, palette, deadline_ms), _table(moves, palette, about, group)]
+    return [_figure(moves, palette, limit), _table(moves, palette, about, group)]
 
 
-def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure:
+def _figure(moves: pl.DataFrame, palette: Palette, limit: Limit) -> Figure:
     import polars as pl
 
     frame = moves.with_columns(
@@ -52,7 +52,7 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
     )
     used = set(frame["to"])
     colours = {name: colour for name, colour in palette.placements.items() if name in used}
-    limits = (Limit(deadline_ms, "deadline"), NO_LIMIT)
+    limits = (limit, NO_LIMIT)
     return Figure(
         "predicted",
         "Predicted over seen, by the placement moved to",
@@ -66,7 +66,8 @@ def _figure(moves: pl.DataFrame, palette: Palette, deadline_ms: float) -> Figure
         "A mark is a move: up, the estimate of the placement at the close at which it was chosen; "
         "across, the mean of what its windows showed at their closes until the next move, without "
         "the first where there are others. Bars: a standard error to each side. Each axis has its "
-        "own range. Line: seen as predicted. Dashed: deadline.",
+        "own range. Line: seen as predicted."
+        f"{f' Dashed: {limit.name}.' if math.isfinite(limit.value) else ''}",
     )
 
 

@@ -16,7 +16,7 @@ from dwell.report.formatting import FINAL_L95
 from dwell.report.palette import Palette
 from dwell.report.table import WITH_WARMUP, Columns, Table, Text
 from dwell.study.metric import METRICS, metric_of
-from dwell.study.summary import latency_ms
+from dwell.study.summary import due_cycles, latency_ms
 
 if TYPE_CHECKING:
     import polars as pl
@@ -94,7 +94,7 @@ def phase_rows(run: Run, header: RunHeader) -> list[PhaseRow]:
     rows = []
     for phase in found:
         inside = (phase.begin_s <= released_s) & (released_s < phase.end_s)
-        mine = cycles.filter(pl.Series(inside))
+        mine = due_cycles(cycles.filter(pl.Series(inside)))
         if mine.is_empty():
             continue
         count = sum(phase.begin_s <= at_s < phase.end_s for at_s, _ in moved_s)
@@ -143,7 +143,8 @@ def phase_table(rows: Sequence[PhaseRow], palette: Palette) -> Table:
         for row in rows
     ]
     caption = (
-        f"All cycles by when they were released. Lost: cycles that never finished. {WITH_WARMUP}"
+        "All cycles with a due sink by when they were released. Lost: cycles that never finished. "
+        f"{WITH_WARMUP}"
     )
     return Table("phases", "By phase", columns, shown, caption=caption)
 

@@ -21,6 +21,7 @@ from dwell.report.charts import (
     Limit,
     distributions,
     intervals,
+    latency_limit,
     stacked,
 )
 from dwell.report.figure import Figure
@@ -68,6 +69,7 @@ class PolicyBlocks:
         self.problem, self.runs, self.latencies = found.problem, found.runs, found.latencies
         self.prefix = prefix
         self.deadline = Limit(found.problem.pipeline.deadline_ms, "deadline")
+        self.latency_limit = latency_limit(found.problem)
         # From the runs: references have runs, too, although they do not compete.
         self.scenarios, self.policies = (
             [str(name) for name in self.runs[column].unique(maintain_order=True)]
@@ -132,16 +134,21 @@ class PolicyBlocks:
         )
 
     def tail(self) -> Figure:
-        """Draw L95 with the deadline."""
+        """Draw L95 with its limit."""
         return self.measure(
             METRICS["l95_ms"],
-            limit=self.deadline,
-            title="L95, the 95th percentile of a window’s latencies, mean over windows",
+            limit=self.latency_limit,
+            title=f"L95, the 95th percentile of {self._latencies()}, mean over windows",
             caption=(
                 "As the controller sees it: a cycle that has not finished counts with its age. "
-                "Dashed: deadline."
+                f"Dashed: {self.latency_limit.name}."
             ),
         )
+
+    def _latencies(self) -> str:
+        """Return what L95 is of."""
+        chain = self.problem.objective.latency
+        return "a window’s latencies" if chain is None else f"a window’s data ages of {chain}"
 
     def distribution(self) -> Figure:
         """Draw the distributions of latency."""
@@ -307,7 +314,7 @@ class PolicyBlocks:
             Text("scenario", "", "scenario"),
             f"Means over {counted(len(set(self.runs['seed'])), 'seed')} with their 95 % intervals"
             f"{' (±: their larger half)' if compact else ''}. L95: 95th "
-            "percentile of a window’s latencies, mean over windows. U_r, U_e: busiest robot and "
+            f"percentile of {self._latencies()}, mean over windows. U_r, U_e: busiest robot and "
             "edge node. Last columns: share of the windows under each placement. "
             f"{WITHOUT_WARMUP} {OURS}",
             self.palette,

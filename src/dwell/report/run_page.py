@@ -25,6 +25,7 @@ from dwell.report.charts import (
     coloured,
     distributions,
     in_order,
+    latency_limit,
     layer,
     limit_rule,
     names,
@@ -54,6 +55,7 @@ from dwell.study.predicted_moves import predicted_moves
 from dwell.study.summary import (
     Counted,
     count_in,
+    due_cycles,
     latency_ms,
     summarise,
 )
@@ -170,7 +172,7 @@ class _RunPage:
         yield Section("Cycles and placements", [self._outcomes(), self._shares()])
         yield Section("Decisions", list(self._decisions()))
         moves = predicted_moves(self.run)
-        if blocks := move_blocks(moves, self.palette, self.header.deadline_ms):
+        if blocks := move_blocks(moves, self.palette, latency_limit(self.header.problem)):
             yield Section("Predicted, then seen", blocks)
         if self.header.live:
             yield Section("How well this is known", [self._known()])
@@ -192,13 +194,30 @@ class _RunPage:
             tracking=self.header.tracking,
             links=links,
             caption=(
-                "L95 seen: of the latencies at the window's close, where a cycle that has not "
-                "finished counts with its age; a triangle at the top is a lost L95. Thin lines: J "
-                "of the other placements as the policy estimated it. Dashed: the aim of 5 %, and "
-                "the deadline. Upright lines: migrations; in colour, the guard's. Shaded: warm-up "
-                "and disturbances. U: all of a node's load, foreign work included."
+                f"{self._seen_l95()}; a triangle at the top is a lost L95. Thin lines: J of the "
+                f"other placements as the policy estimated it. Dashed: {self._limits()}. Upright "
+                "lines: migrations; in colour, the guard's. Shaded: warm-up and disturbances. U: "
+                "all of a node's load, foreign work included."
                 f"{' Marks of the worst windows lead to their cycles.' if links else ''}"
             ),
+        )
+
+    def _seen_l95(self) -> str:
+        """Return the meaning of L95 in the figure: of latencies, or of a chain's ages."""
+        if (chain := self.header.problem.objective.latency) is not None:
+            return f"L95 seen: of the data ages of {chain} at the window's close"
+        return (
+            "L95 seen: of the latencies at the window's close, where a cycle that has not finished "
+            "counts with its age"
+        )
+
+    def _limits(self) -> str:
+        """Return the names of the limits that the figure has."""
+        limit = latency_limit(self.header.problem)
+        return (
+            f"the aim of 5 %, and the {limit.name}"
+            if math.isfinite(limit.value)
+            else "the aim of 5 %"
         )
 
     def _phases(self) -> Iterator[Table]:
@@ -248,13 +267,12 @@ class _RunPage:
         return Table("worst", "", columns, rows, caption=caption, palette=self.palette)
 
     def _cycles(self, window: Mapping[str, object]) -> Figure:
-        """Draw the parts of the latency of every cycle of a window."""
+        """Draw the parts of the latency of every cycle of a window in which a sink is due."""
         import polars as pl
 
         first = int(str(window["first_cycle"]))
-        cycles = self.run.cycles.filter(
-            pl.col("cycle").is_between(first, first + self.header.problem.window_cycles - 1)
-        )
+        last = first + self.header.problem.window_cycles - 1
+        cycles = due_cycles(self.run.cycles.filter(pl.col("cycle").is_between(first, last)))
         frame = cycles.select(
             "cycle",
             pl.col("outcome").cast(pl.String),
@@ -308,7 +326,8 @@ class _RunPage:
     def _latencies(self) -> list[Figure]:
         import polars as pl
 
-        cycles = self.counted.cycles.with_columns(policy=pl.col("placement").cast(pl.String))
+        cycles = due_cycles(self.counted.cycles)
+        cycles = cycles.with_columns(policy=pl.col("placement").cast(pl.String))
         used = [name for name in self.palette.placements if (cycles["policy"] == name).any()]
         lines, parts = [], []
         for name in used:

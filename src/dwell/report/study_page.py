@@ -24,8 +24,8 @@ if TYPE_CHECKING:
 
 #: Metrics by column.
 SHOWN = ("violation_rate", "l95_ms", "cost", "migrations", "regret", "oracle_regret")
-#: Parameters that change the deadline.
-DEADLINES = ("parameter.deadline_ms", "parameter.period_ms")
+#: Parameters that change the limit of L95; a chain's limit has the chain's name in its path.
+LIMITS = ("parameter.deadline_ms", "parameter.period_ms", "parameter.objective.latency")
 
 
 def study_html(study: StudyRuns, *, static: bool = False) -> str:
@@ -168,8 +168,8 @@ def _curve(means: pl.DataFrame, blocks: PolicyBlocks, view: _View, measure: Meas
     if at.dtype.is_numeric():
         frame = frame.sort("at", maintain_order=True)
     limits = {"violation_rate": THE_AIM}
-    if not set(DEADLINES) & set(view.study.parameters):
-        limits["l95_ms"] = blocks.deadline
+    if not any(name.startswith((*LIMITS, "parameter.chains")) for name in view.study.parameters):
+        limits["l95_ms"] = blocks.latency_limit
     remark = f"averaged over {view.shown_averaged}" if view.averaged else ""
     draw = curves(
         frame, measure, blocks.styles, view.shown, limits.get(measure.column, NO_LIMIT), remark

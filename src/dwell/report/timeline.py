@@ -15,6 +15,7 @@ from dwell.report.charts import (
     coloured,
     disc,
     is_wide,
+    latency_limit,
     layer,
     limit_rule,
     name_of,
@@ -112,7 +113,7 @@ def run_timeline(
 
     length_s = float(np.median(np.diff(begin_s))) if len(begin_s) > 1 else 1.0
     end_s = float(begin_s[-1]) + length_s
-    deadline_ms, resources = problem.pipeline.deadline_ms, resources_in(windows, problem)
+    limit, resources = latency_limit(problem), resources_in(windows, problem)
     placements = Palette.of(problem.candidates).placements
     each = 1 if windows.height <= MOST_MARKS else math.ceil(windows.height / MOST_BINS)
     frame = _seen(windows, begin_s + length_s / 2, problem.censor_ms, links or {})
@@ -127,12 +128,13 @@ def run_timeline(
         "spans": _spans(windows, disturbed, begin_s, length_s, end_s),
         "nodes": _used(windows, begin_s + length_s / 2, resources, each),
     }
-    wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), deadline_ms])
-    aim, due = _aim(AIM), limit_rule("y", deadline_ms, "deadline")
+    limits = [limit.value] if math.isfinite(limit.value) else []
+    wide = is_wide([*frame["l95"].drop_nulls().drop_nans(), *limits])
+    aim, due = _aim(AIM), limit_rule("y", *limit)
     used = set(frame["placement"])
     colours = {name: colour for name, colour in placements.items() if name in used}
     rates = _marks("v_d", RATE.heading, colours, each, _range_of(frame["v_d"], 0.0, 100 * AIM))
-    tail_ms = _range_of(frame["l95"], deadline_ms)
+    tail_ms = _range_of(frame["l95"], *limits)
     tails = _marks("l95", L95.heading, colours, each, tail_ms, log=wide)
     costs = _range_of(pl.concat([frame["j"], frames["estimates"]["j"]]))
     priced = [_others(placements, costs), *_marks("j", "J", placements, each, costs)]

@@ -385,6 +385,13 @@ def share_of(those: Mask) -> float:
     return float(np.count_nonzero(those) / len(those))
 
 
+def due_cycles(cycles: pl.DataFrame) -> pl.DataFrame:
+    """Return the cycles in which a sink is due; all others have neither a latency nor a loss."""
+    import polars as pl
+
+    return cycles.filter(pl.col("outcome").cast(pl.String) != "idle")
+
+
 def latency_ms(cycles: pl.DataFrame) -> Floats:
     """Final latencies, infinite for cycles that never finished."""
     final_ms: Floats = (cycles["latency_ns"].cast(float) / 1e6).fill_null(np.inf).to_numpy()

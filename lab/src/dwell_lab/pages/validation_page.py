@@ -18,6 +18,7 @@ from dwell.report.charts import (
     Limit,
     coloured,
     cumulative,
+    latency_limit,
     layer,
     name_of,
     names,
@@ -101,9 +102,9 @@ def _sections(validation: Validation) -> Iterator[Section]:
     yield Section("Verdicts", [_verdicts(validation)])
     yield Section("Latencies", [_latencies(validation), _rates(validation)])
     yield Section("Where the time goes", [_split(validation), _parts(validation)])
-    deadline_ms, palette = validation.problem.pipeline.deadline_ms, _palette(validation)
+    limit, palette = latency_limit(validation.problem), _palette(validation)
     about = (POLICY, Text("run", "run"))
-    if moves := move_blocks(validation.moves, palette, deadline_ms, about, SCENARIO):
+    if moves := move_blocks(validation.moves, palette, limit, about, SCENARIO):
         yield Section("Moves of the runs: predicted, then seen", moves)
     if not validation.jobs.is_empty():
         yield Section("Jobs", [_jobs(validation)], folded=True)

@@ -1,0 +1,75 @@
+"""Pages of cells with several rates: idle cycles are no lost cycles, and L95 may be of ages."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+import dwell
+from dwell.cellfile.cell import from_document
+from dwell.model import Problem
+from dwell.report.charts import latency_limit
+from dwell.report.phases import phase_rows
+from dwell.report.run_header import RunHeader
+from dwell.report.run_page import run_page
+from tests.report.pages import figure_of
+
+
+def sparse(**changes: object) -> Problem:
+    """Return a cell whose only sink runs in every fourth cycle, and takes 3 ms."""
+    document: dict[str, Any] = {
+        "dwell": 1,
+        "name": "sparse",
+        "period_ms": 5,
+        "window_cycles": 8,
+        "nodes": {"R": {"tier": "robot"}},
+        "tasks": {
+            "see": {"every": 8, "on": {"R": {"exec_ms": 1}}},
+            "act": {"every": 4, "on": {"R": {"exec_ms": 3}}},
+        },
+        "flows": [{"from": "see", "to": "act", "sampled": True}],
+        "chains": {"see-act": {"from": "see", "to": "act", "max_age_ms": 90}},
+        "candidates": {"R": {}},
+        "scenarios": {"busy": [{"node": "R", "at_s": 0.2, "stress_threads": 1}]},
+        **changes,
+    }
+    return from_document(document)
+
+
+@cache
+def run() -> dwell.Run:
+    return dwell.simulate(sparse(), scenario="busy", policy="R", seed=1, windows=10)
+
+
+def test_phases_have_no_idle_cycles() -> None:
+    calm, busy = phase_rows(run(), RunHeader.of(run()))
+    assert [calm.cycles, busy.cycles] == [10, 10]
+    assert [calm.lost, busy.lost] == [0, 0]
+    assert math.isfinite(calm.l95_ms)
+    assert math.isfinite(busy.l95_ms)
+    assert busy.violation_rate == 1.0
+
+
+def test_figures_have_no_idle_cycles() -> None:
+    page = run_page(run())
+    (longer,) = figure_of(page, "latencies").frames.values()
+    assert longer.filter(longer["longer"] < 0.1).height > 0
+    cycles = next(one for one in page.figures if one.slug.startswith("cycles-"))
+    assert cycles.frames["lost"].is_empty()
+    assert cycles.frames["parts"]["cycle"].n_unique() == 2
+
+
+def test_the_limit_of_l95_is_of_the_chain_in_j() -> None:
+    assert latency_limit(sparse()) == (5.0, "deadline")
+    assert latency_limit(sparse(objective={"latency": "see-act"})) == (90.0, "age limit")
+
+
+def test_a_page_without_an_age_limit_has_no_line() -> None:
+    unbounded = sparse(
+        chains={"see-act": {"from": "see", "to": "act"}}, objective={"latency": "see-act"}
+    )
+    page = run_page(dwell.simulate(unbounded, policy="R", seed=1, windows=10))
+    caption = figure_of(page, "time").caption
+    assert "of the data ages of see-act" in caption
+    assert "limit" not in caption
