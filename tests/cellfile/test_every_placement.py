@@ -71,3 +71,19 @@ def test_a_search_keeps_all_fallbacks() -> None:
     assert str(fault) == (
         "candidates.keep: 2 is not allowed; it must be at least 3, the number of fallbacks"
     )
+
+
+@pytest.mark.parametrize(
+    ("objective", "key"),
+    [
+        ({"weights": {"age": 1}, "targets": {"age_ms": 50}}, "weights.age"),
+        ({"caps": {"misses": {"m": 1, "k": 20}}}, "caps.misses"),
+    ],
+)
+def test_a_search_refuses_objectives_that_it_does_not_support(
+    objective: dict[str, Any], key: str
+) -> None:
+    (fault,) = faults_of_document({**with_candidates("all"), "objective": objective})
+    assert fault.path == f"objective.{key}"
+    assert "the search of `candidates` does not support it" in fault.message
+    assert from_document({**with_candidates(TO), "objective": objective}).objective.beyond_cycles

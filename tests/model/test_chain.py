@@ -88,3 +88,15 @@ def test_chains_have_columns_of_windows() -> None:
     problem = from_document(cell(see={"from": "camera", "to": "control"}))
     columns = [name for name in column_types("windows", problem) if name.endswith("_see")]
     assert columns == ["age_l95_see", "age_missed_see", "reaction_l95_see"]
+
+
+def test_a_very_large_age_limit_is_never_reached() -> None:
+    largest = Chain("camera", "control", 1e308)
+    assert largest.is_bounded
+    assert largest.max_age_ns == Chain("camera", "control").max_age_ns
+    cell = {
+        **CELL,
+        "chains": {"see": {"from": "camera", "to": "control", "max_age_ms": 1e308}},
+        "objective": {"latency": "see", "targets": {"latency_ms": 50}},
+    }
+    assert from_document(cell).censor_ms == largest.max_age_ns / 1e6

@@ -36,7 +36,8 @@ class Chain:
     @property
     def max_age_ns(self) -> int:
         """Bound on the age in whole nanoseconds, `NEVER_NS` for none."""
-        return min(round(self.max_age_ms * 1e6), NEVER_NS) if self.is_bounded else NEVER_NS
+        age_ns = self.max_age_ms * 1e6
+        return round(age_ns) if age_ns < NEVER_NS else NEVER_NS
 
 
 class ChainPatience(NamedTuple):

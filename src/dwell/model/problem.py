@@ -16,7 +16,7 @@ from dwell.model.declaration import declared, key
 from dwell.model.every_placement import EveryPlacement
 from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict, shortened
-from dwell.model.instants import require_length
+from dwell.model.instants import NEVER_NS, require_length
 from dwell.model.live import LiveSettings
 from dwell.model.objective import Objective
 from dwell.model.pipeline import Pipeline
@@ -109,6 +109,7 @@ class Problem(Displayed):
         priced = self.fabric.has_prices or not self.objective.weighs_price
         bound = "0 in a cell without a link that has a price_per_gb"
         require(priced, "objective.weights.price", self.objective.weights.price, bound)
+        self._require_searchable()
         self._require_due_sinks()
         self._require_supported_replicas()
 
@@ -129,6 +130,15 @@ class Problem(Displayed):
                 f"{controller.estimator or 'its usual estimator'}, begins with {self.initial}>",
             )
         )
+
+    def _require_searchable(self) -> None:
+        """Refuse objectives that the search of placements does not support."""
+        name = self.objective.beyond_cycles
+        if self.is_searched and name:
+            message = (
+                "the search of `candidates` does not support it; remove it, or list candidates"
+            )
+            raise ProblemError([Fault(f"objective.{name}", message)])
 
     def _require_due_sinks(self) -> None:
         """Refuse windows in which a sink never runs, and camera frames in cells with rates."""
@@ -338,7 +348,8 @@ class Problem(Displayed):
             every = pipeline.rates[chain.target]
             usual_ms = chain.max_age_ms if chain.is_bounded else usual_ms
         bound_ms = max(4 * usual_ms, 2 * every * pipeline.period_ms)
-        return max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
+        bound_ms = max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
+        return min(bound_ms, NEVER_NS / 1e6)
 
     @property
     def shadow_fraction(self) -> float:
