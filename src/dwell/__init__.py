@@ -48,7 +48,7 @@ _HOME = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for, and nothing else (PEP 562).
+    """Import a public name at its first use (PEP 562).
 
     Raises
     ------

@@ -649,7 +649,7 @@ class Controller:
     def resume(self, name: str, *, fallback: bool = False) -> None:
         """Record the placement of the cell after a move that this controller did not decide.
 
-        A person has moved the cell, or this controller takes over from another one. n_d becomes 0,
+        A person has moved the cell, or this controller takes over from another. n_d becomes 0,
         and the cost of the next window has no switching term.
 
         Parameters
@@ -665,7 +665,7 @@ class Controller:
             self.coordination.place(name)
 
     def _find(self, name: str, believed: str) -> None:
-        """Report the placement of the cell to a policy that assumes another one."""
+        """Report the placement of the cell to a policy that assumes another placement."""
         if name != believed:
             # The second report has no move, and thus removes the switching term.
             self._adopt(name)

@@ -43,7 +43,7 @@ class FleetSearch:
         self._prices, self._loads, self._rank, self._before = prices, loads, rank, before
         self._neighbours = Neighbours(prices.cells, loads)
         self._dwells = [cell.problem.min_dwell_decisions > 0 for cell in prices.cells]
-        #: By cell, whether it may move; None if it does not belong to the search.
+        #: By cell, whether it may move; None for a cell outside the search.
         self._free: list[bool | None] = [None] * len(prices.cells)
         self._plays, self._spent = 0, False
         #: Cells that have decided since the change; None after the search.
@@ -75,7 +75,7 @@ class FleetSearch:
             self._free[index] = False
 
     def spend(self) -> None:
-        """Record a move of a single cell: there are no more simulations before the search."""
+        """Record a move of a single cell: nothing is simulated any more before the search."""
         self._spent = True
 
     def is_free(self, index: int) -> bool:

@@ -122,7 +122,7 @@ class _OriginSilence(_Silence):
 
 
 class FallbackRound:
-    """The order in which fallbacks are tried: each once, failed ones last.
+    """The order in which fallbacks are tried: each once, those that failed last.
 
     A *round* begins when cycles stop completing, and ends with the next completed cycle or order.
 
@@ -170,7 +170,7 @@ class FallbackRound:
         self._tried.add(to)
 
     def again(self) -> None:
-        """Begin another round: each fallback may be tried again, failed ones last."""
+        """Begin another round: each fallback may be tried again, those that failed last."""
         self._tried.clear()
 
     def over(self) -> None:
@@ -199,13 +199,13 @@ class Guard:
       change nothing.
     * The guard ignores completions of cycles that were never released here.
     * The newest origin of a chain is the highest cycle from which one of its actuations descends,
-      or, before there is one, the first cycle with an origin that the guard waits for. Moves, rests
+      or at first the first cycle with an origin that the guard waits for. Moves, rests
       and restarts apply to origins as they do to cycles.
 
     The guard is *on a fallback* from its own move until the next order. A fallback *carries* the
     cell once one of its cycles has completed and each guarded chain has actuated from one of its
     cycles. If one of these does not occur within its patience, the fallback has failed, and the
-    guard tries the next one at once. It tries each fallback once per round, in this order:
+    guard tries the next at once. It tries each fallback once per round, in this order:
 
     1. the fallback that carried the cell before an order left it, until a cycle has completed that
        was released more than `probe_cycles` cycles after the last one under that fallback;
@@ -213,7 +213,7 @@ class Guard:
     3. fallbacks that have failed since the last completed cycle or order, earliest failure first.
 
     After its move the guard *rests* for `probe_cycles` cycles: once a first cycle has completed (or
-    a chain has actuated), it does not wait for the remaining ones. It also rests when it has tried
+    a chain has actuated), it does not wait for the others. It also rests when it has tried
     every available fallback and no cycle has completed. The next round then begins when the guard
     would fire again, but a fallback that becomes available is tried at once. Every further rest
     before an order is twice as long, up to 32 times `probe_cycles`; this limits the moves of a cell
@@ -221,8 +221,8 @@ class Guard:
     because the controller may keep the fallback or may be down. A fallback ordered by the
     controller gets no rest.
 
-    **Bound.** Assume that the guard does not rest, and that f fallbacks are available, at least one
-    of which can carry the cell. Let n be D / P, rounded up: `Pipeline.open_cycles`. Then at most
+    **Bound.** Assume that the guard does not rest, that f fallbacks are available, and that at
+    least one can carry the cell. Let n be D / P, rounded up: `Pipeline.open_cycles`. Then at most
     (f + 1)(g + n) consecutive cycles bring no actuation. Each placement that fails costs its first
     lost cycle, the cycles released in the patience after it, and a cycle that may be released at
     the instant of the move. After a single fault the bound is g + n if the first fallback works.

@@ -163,7 +163,7 @@ class FleetLedger:
         return f"<FleetLedger of {len(self.cells)} cells: round {self.round}>"
 
     def place(self, index: int, name: str) -> None:
-        """Record the placement of a cell; another one than recorded begins a change."""
+        """Record the placement of a cell; a change begins if another was recorded."""
         if name != self.placements[index]:
             self._put(index, name)
             self._change()

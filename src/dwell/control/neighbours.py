@@ -43,7 +43,7 @@ class _Move(NamedTuple):
 
 
 class Neighbours:
-    """Predicts Φ of placements near simulated ones.
+    """Predicts Φ of placements near simulated placements.
 
     The table of loads ignores which cells meet. Two corrections account for it. When a cell moves,
     its difference between simulated and tabulated cost disappears. When a cell joins others of its
@@ -182,7 +182,7 @@ def _with(placements: Sequence[str], *moves: _Move) -> tuple[str, ...]:
 
 
 def _nearness(one: PricedCell, other: PricedCell) -> float:
-    """Return 1 for equal phases, -1 for opposite ones, 0 for other periods."""
+    """Return 1 for equal phases, -1 for opposite phases, 0 for other periods."""
     a, b = one.problem.pipeline, other.problem.pipeline
     if a.period_ms != b.period_ms:
         return 0.0

@@ -93,7 +93,7 @@ class CostBounds:
         self._needed = NeededCycles(pipeline, real.cycles)
         self._never = {name for name in self.order if self._needed.is_never(name)}
         self._has_rates = pipeline.has_rates
-        # What a window's end knows of a cycle is at most its age then.
+        # At a window's end the latency of a cycle counts for at most its age.
         last_ns = real.release_ns[self._width - 1 : -1 : self._width]
         beyond_ns = real.release_ns[self._width :: self._width]
         close_ns = window_close_ns(problem, last_ns, beyond_ns)

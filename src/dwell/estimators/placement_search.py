@@ -53,7 +53,7 @@ class Ranking:
     Parameters
     ----------
     best : tuple of Ranked
-        In ascending order of J; equal ones in the file's order of nodes, task by task.
+        In ascending order of J; with equal J in the file's order of nodes, task by task.
     cycles : int
         Simulated cycles per placement and scenario.
     is_exact : bool
@@ -61,7 +61,7 @@ class Ranking:
     gap : float
         Largest share of the best J by which another placement may be cheaper; 0 if exact.
     placements : int
-        Number of placements of the cell, with those that are not feasible.
+        Number of placements of the cell, feasible or not.
     looked : int
         Partial and complete placements whose bound was computed.
     simulated : int
@@ -294,7 +294,7 @@ class _Search:
         del self._lowest[self._top :]
 
     def _canonical(self, nodes: Mapping[str, str]) -> Placement:
-        """Return the placement that is first in order among those that differ by twins only."""
+        """Return the first placement in order that differs from this by twins only."""
         names = {node: node for node in self._problem.fabric.nodes}
         for group in self._twins:
             used = [
@@ -377,7 +377,7 @@ def is_linked(problem: Problem, nodes: Mapping[str, str], name: str, node: str) 
 
 
 def _first_linked(problem: Problem) -> Placement:
-    """Return a placement whose flows all have links; raise PlacementError if there is none."""
+    """Return a placement whose flows all have links; raise PlacementError without one."""
     tasks, order = problem.pipeline.tasks, problem.pipeline.topological()
     pruned: Counter[str] = Counter()
     stack: list[dict[str, str]] = [{}]

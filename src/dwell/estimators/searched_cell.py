@@ -17,8 +17,8 @@ KNOWN = Remembered[Problem, Mapping[str, Placement]](8)
 def searched(problem: Problem) -> Problem:
     """Return the problem with the candidates that its search finds; others as they are.
 
-    The search is `dwell.search` in baseline, with 1,000 cycles and seed 0. The named candidates are
-    the first ones. As A1, A2 and so on follow the cheapest placement, the cheapest without each of
+    The search is `dwell.search` in baseline, with 1,000 cycles and seed 0. The named candidates
+    are first. As A1, A2 and so on follow the cheapest placement, the cheapest without each of
     its nodes in turn, and the next cheapest.
 
     Raises

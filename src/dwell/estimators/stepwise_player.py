@@ -55,7 +55,7 @@ class _Twin:
         self.latency_ns: deque[Ints] = deque(maxlen=kept)
         self.missed: deque[NDArray[np.bool_]] = deque(maxlen=kept)
         self.price: QoS | None = None
-        #: Whether the price's L95 and V_D are differences from the declared ones.
+        #: Whether the price's L95 and V_D are differences from declared values.
         self.is_relative = False, False
 
     def add(
@@ -231,7 +231,7 @@ class StepwisePlayer:
     def difference_errors(self, name: str, other: str) -> tuple[float, float]:
         """Return the errors of the differences of L95 (ms) and V_D of two simulated candidates.
 
-        The differences are those of the steps that both have, which are of the same cycles.
+        The differences are of the steps that both have, over the same cycles.
         """
         pair = name, other
         errors = [self.played(one).error or NO_ERROR for one in pair]

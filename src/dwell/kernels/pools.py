@@ -108,7 +108,7 @@ class HeldValues:
         return out[0], out[1]
 
     def begin(self, values: Floats, sums: tuple[float, float, float], window: int) -> None:
-        """Start again with these values, none of which counts as measured."""
+        """Start again with these values; none counts as measured."""
         row = self.row
         if len(values) > len(self._held):
             self._held = np.empty(len(values))

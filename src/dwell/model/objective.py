@@ -92,7 +92,7 @@ class MissCap:
 
     @property
     def least_cycles(self) -> int:
-        """Least number of simulated cycles of which the share of stretches is taken."""
+        """Least number of simulated cycles for the share of stretches."""
         return 20 * self.k
 
 

@@ -66,7 +66,7 @@ class Placement(FrozenDict[str, Nodes]):
 
     @property
     def sites(self) -> tuple[tuple[str, str], ...]:
-        """Task and node of each job of a cycle, those of the first copy first."""
+        """Task and node of each job of a cycle, the first copy's first."""
         return tuple(dict.fromkeys(site for copy in self.copies for site in copy.items()))
 
     @property

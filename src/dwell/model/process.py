@@ -194,7 +194,7 @@ class AR1(_ByLogarithm):
 
     The logarithm is a Gaussian AR(1) process. Its correlation r gives the *value* (not the
     logarithm) exactly the declared mean, coefficient of variation and correlation: for a
-    lognormal pair, corr = (exp(r s^2) - 1) / (exp(s^2) - 1), hence
+    lognormal pair, corr = (exp(r s^2) - 1) / (exp(s^2) - 1), so
     r = log(1 + rho cv^2) / s^2 with s^2 = log(1 + cv^2).
     """
 

@@ -56,10 +56,10 @@ def shadow_stamps(
 ) -> NDArray[np.int16]:
     """Return the candidate that each cycle of a stretch is also sent through, -1 for none.
 
-    Cycle c is sent through the i-th alternative where the fractional part of c times the golden
-    ratio lies in [i * fraction, (i + 1) * fraction): every alternative gets its fraction of any
-    stretch within a few cycles, evenly spread and in step with no periodic disturbance, and no
-    cycle is sent through two (H. Weyl, 1916, DOI 10.1007/BF01475864).
+    Cycle c is sent through the i-th alternative if the fractional part of c times the golden ratio
+    lies in [i * fraction, (i + 1) * fraction). So no cycle is sent through two alternatives. Each
+    gets its fraction of any stretch within a few cycles, evenly spread and in step with no periodic
+    disturbance (H. Weyl, 1916, DOI 10.1007/BF01475864).
 
     Parameters
     ----------

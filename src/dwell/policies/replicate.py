@@ -1,7 +1,7 @@
 """Replicate: adds a second copy of each cycle to the placement that another policy chooses.
 
 A *base* policy decides among the candidates with one copy: it sees their estimates alone, and its
-incumbent X is one of them. A candidate with replicas of which X is a member is a *pair* of X. In
+incumbent X is one of them. A candidate with replicas, one of them X, is a *pair* of X. In
 every decision, after the base's, the cheapest pair P of X is compared with X:
 
 * P replaces X, or X replaces P, if it is cheaper by more than Delta_min and the margin of the two
@@ -59,8 +59,8 @@ class Replicate(PricingPolicy):
     min_dwell : int
         N_min, in calls of `decide`.
     min_improvement : float
-        Delta_min, in units of J: what a second copy must save to come into force, and cost to
-        leave it.
+        Delta_min, in units of J: a second copy that comes into force must save more, and a copy
+        that leaves must cost more.
 
     Raises
     ------
@@ -186,7 +186,7 @@ class Replicate(PricingPolicy):
     def _pair_of(
         self, pairs: list[str], estimates: Mapping[str, QoS], costs: Mapping[str, float]
     ) -> str:
-        """Return the pair to compare with X: the cheapest; empty if there is none.
+        """Return the pair to compare with X: the cheapest; empty without a pair.
 
         A pair in force gives way only to one that is cheaper by Delta_min and their error.
         """

@@ -385,7 +385,7 @@ class _Sizes:
 
     @property
     def useless(self) -> bool:
-        """Whether one cell alone misses so much that a limit on the excess is useless."""
+        """Whether one cell alone misses too much for a limit on the excess."""
         return self.alone > self.limit + ROUNDING and self.alone >= USELESS
 
     @property

@@ -11,7 +11,7 @@ from dwell.sim import drawn_scenario
 
 
 def disturbances_of(run: Run) -> Scenario:
-    """Return the disturbances of a run with their times: the recorded ones, else sampled again.
+    """Return the disturbances of a run with their times: recorded, else sampled again.
 
     Raises
     ------

@@ -95,11 +95,11 @@ def share_interval(values: Values, *, windows: int | None = None) -> Interval:
 
     The studentised bootstrap covers the spread between runs. It does not cover events that no run
     showed; the number of windows limits these. A kind of window with probability p is absent from
-    N windows with probability (1 - p)^N, which equals the tail at p = 1 - tail^(1/N), about 3/N. At
-    worst all cycles of such a window miss. The upper limit is therefore at least (1 - p) · mean + p
-    and the lower limit at most (1 - p) · mean. The argument assumes that every kind of window
-    occurs in the windows of any run independently. It does not cover a kind of window that fills
-    one run in ten and never occurs in the other runs.
+    N windows with probability (1 - p)^N, which equals the tail at p = 1 - tail^(1/N), about
+    3.7/N. At worst all cycles of such a window miss. The upper limit is therefore at least
+    (1 - p) · mean + p and the lower limit at most (1 - p) · mean. The argument assumes that
+    every kind of window occurs in the windows of any run independently. It does not cover a kind of
+    window that fills one run in ten and never occurs in the other runs.
 
     Parameters
     ----------
@@ -367,7 +367,7 @@ def _limit_by_weights(values: tuple[float, ...], tail: float) -> float:
 
 
 def _by_student(sample: Floats, tail: float, low: float, high: float) -> tuple[float, float]:
-    """Limits of a mean, infinite ones replaced by Student's."""
+    """Limits of a mean; Student's replace infinite limits."""
     if not (math.isinf(low) or math.isinf(high)):
         return low, high
     mean, half = float(sample.mean()), _half_width(sample, tail)

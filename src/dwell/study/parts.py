@@ -31,7 +31,7 @@ PARTS = "parts"
 LABELS = ("scenario", "policy", "seed")
 #: Runs of a batch at most: enough that a file's fixed size does not count.
 BATCH_RUNS = 512
-#: Batches per process, so that all processes end at about the same time.
+#: Batches per process: all processes end at about the same time.
 BATCHES = 4
 NAME = re.compile(r"([0-9a-f]{16})-(\d+)-(\d+)\.parquet")
 
@@ -89,7 +89,7 @@ class Parts:
 
     @property
     def done(self) -> int:
-        """Number of runs that are there."""
+        """Number of finished runs."""
         parts = (part for one in self.study.contenders for part in self.known[one.name])
         return sum(self.points[part.end] - self.points[part.first] for part in parts)
 

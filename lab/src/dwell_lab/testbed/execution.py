@@ -59,7 +59,7 @@ class State(NamedTuple):
     """Progress of a campaign.
 
     `planned` and `done` count runs, `given_up` names runs that failed in every repeat, and
-    `failures` counts all failed attempts, including those of completed runs.
+    `failures` counts all failed attempts, also of completed runs.
     """
 
     planned: int

@@ -20,7 +20,7 @@ class Counters(NamedTuple):
     """Counters of the machine since boot.
 
     `busy` and `all` are used and elapsed CPU time over all CPUs, seconds. `waited_s` is the time in
-    which some task waited for a CPU; None if the kernel does not report it.
+    which some task waited for a CPU; None if the kernel does not count it.
     """
 
     at_s: float
@@ -59,7 +59,7 @@ class Idle(NamedTuple):
 
 def sample() -> Counters:
     """Read the counters of this machine."""
-    import psutil  # what a campaign has measured is read without it
+    import psutil  # not needed to read the results of a campaign
 
     times = psutil.cpu_times()
     # User and nice time already include guest time.

@@ -6,7 +6,7 @@ is high whenever a node is stressed. PSI and the speed of the CPUs (``work_ms``)
 decide nothing. The criteria, for the CPUs of nodes (`Rule` has the numbers):
 
 ``full``
-    The CPU was hardly idle during stretches of 0.2 s that make up over a tenth of the window. Nodes
+    The CPU was hardly idle during stretches of 0.2 s, together over a tenth of the window. Nodes
     alone cannot fill a CPU, because a part of every CPU is never allotted (see `allotment`).
 ``stolen``
     The hypervisor gave the CPU to other machines.

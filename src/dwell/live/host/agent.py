@@ -219,7 +219,7 @@ class Agent:
         return min(wakes)
 
     def _beat(self, now_ns: int) -> int:
-        """Send the beats of the node if they are due; return when the next ones are."""
+        """Send the beats of the node if they are due; return when they are due next."""
         place = self.place
         period_ns, delay_ns = place.period_ns, place.period_ns // AGENT_DELAY
         if self._send_ns > now_ns >= self._send_ns - period_ns:

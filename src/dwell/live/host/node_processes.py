@@ -1,4 +1,4 @@
-"""Agents and controller that one process starts: those of a testbed, or of `dwell live up`."""
+"""Agents and controller that one process starts, for a testbed or for `dwell live up`."""
 
 from __future__ import annotations
 

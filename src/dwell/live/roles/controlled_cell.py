@@ -88,7 +88,7 @@ class _Move:
     order: Order | None = None
     sent_ns: int = 0
     refused: str = ""
-    # Whether its order was refused for now, so that the next one needs a new number.
+    # Whether its order was refused for now: the next order needs a new number.
     anew: bool = False
     # The policy's proposal; None for an operator's move.
     proposal: Proposal | None = None

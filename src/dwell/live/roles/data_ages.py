@@ -48,7 +48,7 @@ class KnownOrigins(NamedTuple):
 
 
 class Actuation(NamedTuple):
-    """An actuation of a chain: its cycle's place, its instant, and what it descends from.
+    """An actuation of a chain: its cycle's place, its instant, and its origin.
 
     `born_ns` is the release of its origin, and `newest` the newest cycle, or None.
     """

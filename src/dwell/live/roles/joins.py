@@ -9,7 +9,7 @@ from typing import TypeAlias
 from dwell.live.wire.messages import Header, Hop
 from dwell.model.pipeline import LONGEST_DEADLINE
 
-#: Largest number of cycles that wait for the rest of their inputs: those of the longest deadline.
+#: Largest number of cycles that wait for the rest of their inputs, by the longest deadline.
 MAX_JOINS = LONGEST_DEADLINE
 #: Header, payload and time of arrival by source task.
 Inputs: TypeAlias = dict[str, tuple[Header, bytes, int]]
@@ -50,10 +50,10 @@ class Job:
 
 @dataclass(slots=True)
 class Joins:
-    """Inputs of incomplete cycles; a complete cycle evicts earlier ones whose deadline has passed.
+    """Inputs of incomplete cycles.
 
-    These are `open_cycles` or more before it. `drop` gets the headers of inputs that are too late
-    or evicted.
+    A complete cycle evicts cycles `open_cycles` or more before it: their deadlines have passed.
+    `drop` gets the headers of inputs that are too late or evicted.
     """
 
     sources: frozenset[str]

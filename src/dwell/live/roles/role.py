@@ -340,7 +340,7 @@ class Pulse:
 
     The process writes its beat into its slot, and the agent of the node sends it with the others.
     If the agent's receipt for the last beat is missing, the process sends the beat itself. Then the
-    stamper and all others do, too, so that the node hears them and they hear the node.
+    stamper and all others do the same: the node hears them, and they hear the node.
 
     `state` returns whether the process is ready, and the reason if not or its last problem; `holds`
     returns the optional fields of the beat. `hears` names the nodes and processes (or ``*``)

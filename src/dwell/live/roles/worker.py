@@ -240,7 +240,7 @@ class Worker:
         else:
             self._jobs.append(job)
             if len(self._jobs) > (self._depth or 10 * MAX_JOINS):
-                # Of the oldest waiting job and the new job, the earlier cycle.
+                # The oldest waiting job or the new job, whichever has the earlier cycle.
                 overtaken = job.order < self._jobs[0].order
                 self._replace(self._jobs.pop() if overtaken else self._jobs.popleft())
 

@@ -37,7 +37,7 @@ def faults(own: RosEndpoint, others: Collection[RosEndpoint]) -> Iterator[str]:
 
 
 def notes(own: RosEndpoint, others: Collection[RosEndpoint]) -> Iterator[str]:
-    """Yield the QoS of connected endpoints that give less than is asked for, and rivals."""
+    """Yield the QoS of connected endpoints that give less than required, and rivals."""
     for other in others:
         if not matches(own, other):
             continue

@@ -1,6 +1,6 @@
 """Names and bytes of rmw_zenoh: keys of topics, liveliness tokens, QoS, attachments.
 
-They are those of ROS 2 Jazzy and later (docs/howto/ros2.md). Nothing here does I/O.
+As in ROS 2 Jazzy and later (docs/howto/ros2.md). Nothing here does I/O.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class RosNode:
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Name, type and hash of a topic; only equal ones are connected."""
+    """Name, type and hash of a topic; only equal topics are connected."""
 
     name: str
     type: str

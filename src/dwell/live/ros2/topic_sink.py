@@ -16,7 +16,7 @@ from dwell.model.ros_topics import RosCommands
 class Sink(CellActuator):
     """An actuator that publishes each command: CDR bytes, or a struct with the type's fields.
 
-    `hold` publishes nothing, so that the robot's own watchdog acts. A message whose type begins
+    `hold` publishes nothing: the robot's own watchdog acts. A message whose type begins
     with a header gets the stamp of the oldest ROS source behind the command.
 
     Parameters

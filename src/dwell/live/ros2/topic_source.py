@@ -30,11 +30,11 @@ SILENT_NS = 500_000_000
 
 
 class Source(CellStage):
-    """A stage that hands on the messages of a ROS topic, each by its newest one.
+    """A stage whose jobs pass on the newest message of a ROS topic.
 
     Images arrive as arrays, compressed images as the bytes of their format, all other types as
-    their CDR bytes (`dwell.ros2.decode`). A message of which more than ``live.max_age_ms`` has
-    passed since its arrival is not handed on: the job fails.
+    their CDR bytes (`dwell.ros2.decode`). A message that arrived more than ``live.max_age_ms``
+    ago is not passed on: the job fails.
 
     Parameters
     ----------
