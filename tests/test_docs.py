@@ -152,6 +152,13 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert anchor in heading_anchors(linked), target
 
 
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_items_in_items_have_four_spaces(page: Path) -> None:
+    """With fewer the site counts them as items of the outer list: rules get wrong numbers."""
+    prose = FENCE.sub("", page.read_text(encoding="utf-8"))
+    assert re.findall(r"^ {1,3}[*-] .*", prose, re.MULTILINE) == []
+
+
 def test_pictures_are_small() -> None:
     for picture in (ROOT / "docs" / "images").iterdir():
         assert picture.stat().st_size < 400_000
