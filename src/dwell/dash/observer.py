@@ -3,7 +3,8 @@
 It subscribes to two channels of the protocol, like a controller: the stamps of the stamper, and the
 messages that the relay's agent gathers (beats, completions, answers, loads). It also requests the
 status of the controller, like `dwell live status`. With keys it signs as an operator or observer
-and accepts only signed messages.
+and accepts only signed messages; it uses newer keys as a controller does
+(`dwell.live.host.key_renewal`).
 
 Instants are converted to the stamper's clock, as in the controller (`dwell.live.roles.offsets`,
 `dwell.live.roles.cycle_ledger`), and count from the first release of the run.
@@ -14,26 +15,27 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from dwell.dash.feed import Feed
 from dwell.errors import LiveError
 from dwell.live.failures import start_thread
 from dwell.live.host.operator_client import OperatorClient
-from dwell.live.host.security import Security
 from dwell.live.log import printable
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle
 from dwell.live.roles.role import Pulse
 from dwell.live.wire import channels
 from dwell.live.wire.local_addresses import running_elsewhere
 from dwell.live.wire.messages import Stamped
-from dwell.live.wire.transport import Arrival
-from dwell.live.wire.wiring import Role
+from dwell.live.wire.transport import Arrival, Transport
 from dwell.model import Problem
 from dwell.model.instants import NEVER_NS
 from dwell.record import shown_reason
+
+if TYPE_CHECKING:
+    from dwell.live.trust.keyring import Keyring
 
 #: Largest number of cycles (with jobs, 2 to 3 kB each), windows and events in memory.
 MOST_CYCLES, MOST_WINDOWS, MOST_EVENTS = 4_000, 4_000, 1_000
@@ -174,7 +176,7 @@ class Observer:
     windows : Feed of ObservedWindow
     events : Feed of CellEvent
     security : Security
-        With the keyring, if any.
+        With the keyring in use, if any.
 
     Raises
     ------
@@ -185,22 +187,23 @@ class Observer:
     """
 
     def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
-        self.problem, self._environment = problem, environment
+        self.problem = problem
         self.cycles: Feed[ObservedCycle] = Feed(MOST_CYCLES)
         self.windows: Feed[ObservedWindow] = Feed(MOST_WINDOWS)
         self.events: Feed[CellEvent] = Feed(MOST_EVENTS)
         self._client = OperatorClient(problem, environment)
         self._lock = threading.Lock()
         self._stopped = threading.Event()
-        relay, stamper = problem.relay_node, f"stamper@{problem.stamper_node}"
+        self.security = self._client.security
         who = f"{self._client.name}-hears"
-        role = Role(who, problem.controller_node, "visitor")
-        self.security = Security.of(problem, role, environment)
-        transport = self.security.visit(who, stamper, f"agent@{relay}")
         # The observer's clock does not belong to the cell: the place has no node.
-        self._place = self.security.place(who, "", transport, lambda _: None)
-        self._transport = transport
+        self._place = self.security.place(who, "", self._visit(who), lambda _: None)
         self._pulse = Pulse(self._place, lambda: (True, ""), hears=[("*", "*")])
+        self._renew: Callable[[], None] = lambda: None
+        if (keyring := self.security.keyring) is not None:
+            from dwell.live.host.key_renewal import KeyRenewal
+
+            self._renew = KeyRenewal(keyring.folder, self, self._pulse, self._connected).step
         self._offsets = self._place.offsets()
         self._ledger = Ledger(problem, self._offsets)
         self._deadline_ns = problem.pipeline.deadline_ns
@@ -220,17 +223,33 @@ class Observer:
     def __enter__(self) -> Observer:
         """Request the status once, then subscribe and start the thread of requests."""
         self._look()
-        keys = self._place.keys
-        for key in (keys.of(channels.STAMPED), keys.of(channels.GATHERED)):
-            self._transport.subscribe(key, self._heard)
-        start_thread("asks", self._ask_on)
+        self.hear_through(self._place.transport)
+        self._asks = start_thread("asks", self._ask_on)
         return self
 
     def __exit__(self, *_: object) -> None:
         """Stop the requests and close the connections."""
         self._stopped.set()
-        self._transport.close()
+        self._asks.join()
+        self._place.transport.close()
         self._client.__exit__()
+
+    def hear_through(self, transport: Transport) -> None:
+        """Subscribe to the stamps and to the gathered messages on a transport."""
+        keys = self._place.keys
+        for key in (keys.of(channels.STAMPED), keys.of(channels.GATHERED)):
+            transport.subscribe(key, self._heard)
+
+    def _visit(self, who: str) -> Transport:
+        relay, stamper = self.problem.relay_node, self.problem.stamper_node
+        return self.security.visit(who, f"stamper@{stamper}", f"agent@{relay}")
+
+    def _connected(self, keyring: Keyring) -> Transport:
+        """Connect again with newer keys, also to the controller."""
+        self.security = replace(self.security, keyring=keyring)
+        self._client.__exit__()
+        self._client = OperatorClient(self.problem, security=self.security)
+        return self._visit(self._place.who)
 
     def act(self, what: str, about: str = "") -> Mapping[str, Any]:
         """Send a command to the controller: pin, unpin, drain or undrain; return its status.
@@ -243,7 +262,7 @@ class Observer:
             If the keys allow only reading.
         """
         # The thread of requests uses the other client.
-        with OperatorClient(self.problem, self._environment) as client:
+        with OperatorClient(self.problem, security=self.security) as client:
             status = client.ask(what, about)
         self._answer(status)
         return status
@@ -376,6 +395,7 @@ class Observer:
         apart_ms = self.problem.decide_cycles * self.problem.pipeline.period_ms
         every_s = min(max(apart_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
         while not self._stopped.wait(every_s):
+            self._renew()
             self._look()
 
     def _look(self) -> None:

@@ -119,10 +119,10 @@ def _require_operator(observer: Observer) -> None:
 
 def _logged(observer: Observer) -> Callable[[str, str], Mapping[str, Any]]:
     """Return a function that sends commands; it logs time, command, certificate and result."""
-    keyring = observer.security.keyring
-    who = "without keys" if keyring is None else f"by {keyring.own.common_name}"
 
     def act(what: str, about: str) -> Mapping[str, Any]:
+        keyring = observer.security.keyring
+        who = "without keys" if keyring is None else f"by {keyring.own.common_name}"
         words = printable(f"{what} {about}".strip())[:200]
         said = f"{datetime.now().astimezone().isoformat(timespec='milliseconds')} {words} {who}"
         try:

@@ -13,9 +13,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Protocol
 
 from dwell.errors import TrustError
-from dwell.live.host.hosting import Hosted
 from dwell.live.host.supervision import Supervisor
 from dwell.live.roles.role import Pulse
 from dwell.live.trust.keyring import Keyring
@@ -31,6 +31,13 @@ EVERY_S = 20.0
 LAST = timedelta(hours=1)
 
 
+class Listener(Protocol):
+    """Receives the messages of a process."""
+
+    def hear_through(self, transport: Transport) -> None:
+        """Subscribe to the messages on a transport."""
+
+
 class KeyRenewal:
     """Applies newer keys: restarts a node's processes in turn, then reconnects this process.
 
@@ -41,14 +48,14 @@ class KeyRenewal:
     def __init__(
         self,
         source: Path,
-        hosted: Hosted,
+        listener: Listener,
         pulse: Pulse,
         connect: Callable[[Keyring], Transport],
         *,
         copy: Path | None = None,
         supervisor: Supervisor | None = None,
     ) -> None:
-        self._source, self._hosted, self._pulse = source, hosted, pulse
+        self._source, self._listener, self._pulse = source, listener, pulse
         self._connect, self._copy, self._supervisor = connect, copy, supervisor
         self._place = pulse.place
         nodes = list(self._place.problem.fabric.nodes)
@@ -74,7 +81,7 @@ class KeyRenewal:
             return
         place.transport.close()
         place.seals, place.transport = Seals(self._new), self._connect(self._new)
-        self._hosted.hear_through(place.transport)
+        self._listener.hear_through(place.transport)
         self._new = None
 
     def _news(self, own: Keyring) -> Keyring | None:

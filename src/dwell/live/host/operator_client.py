@@ -33,7 +33,12 @@ class OperatorClient:
     node's.
     """
 
-    def __init__(self, problem: Problem, environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        problem: Problem,
+        environment: Mapping[str, str] | None = None,
+        security: Security | None = None,
+    ) -> None:
         self.problem = problem
         self.name = f"visitor-{uuid.uuid4().hex[:8]}"
         self._controller = f"controller@{problem.controller_node}"
@@ -42,8 +47,9 @@ class OperatorClient:
         self._wishes = itertools.count(1)
         self._answered_s: float | None = None
         role = Role(self.name, problem.controller_node, "visitor")
-        security = self._security = Security.of(problem, role, environment)
-        self._transport = security.visit(self.name, self._controller)
+        #: By default as the environment sets it.
+        self.security = security or Security.of(problem, role, environment)
+        self._transport = self.security.visit(self.name, self._controller)
         self._transport.subscribe(self._keys.of(channels.ANSWER, "*"), self._heard)
 
     def __enter__(self) -> OperatorClient:
@@ -72,7 +78,7 @@ class OperatorClient:
         to pin or the node to drain. Raises a LiveError if the controller refuses the request or
         does not answer, and a TrustError if an observer's keys do not permit it.
         """
-        keyring = self._security.keyring
+        keyring = self.security.keyring
         if what != "status" and keyring is not None and keyring.own.role == "observer":
             raise TrustError(f"{keyring.folder}: keys of an observer, who may look and no more")
         answer = self._answer(what, about, patience_s)
@@ -139,7 +145,7 @@ class OperatorClient:
 
     def _ended(self) -> str:
         """Return a sentence if the controller's certificate in the roster has expired, else ''."""
-        keyring = self._security.keyring
+        keyring = self.security.keyring
         known = [] if keyring is None else keyring.roster.of(CONTROLLER)[:1]
         ends = [one.ends for one in known if one.ends < datetime.now(UTC)]
         return "".join(f" its certificate ended on {end:%Y-%m-%d %H:%M} UTC" for end in ends)
