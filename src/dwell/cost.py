@@ -54,8 +54,7 @@ __all__ = [
     "price",
     "tier_nodes",
     "tier_utilisation",
-    "weighed_age_ms",
-    "weighed_price",
+    "weighed",
 ]
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
@@ -240,36 +239,25 @@ def cost(qos: QoS, current: Placement, previous: Placement, objective: Objective
     """
     robot, edge, cloud = tier_utilisation(qos.utilisation, objective)
     switching = hamming(current, previous)
-    weighed = weighed_age_ms(qos, objective), weighed_price(qos, objective)
-    rate = qos.violation_rate
-    J = float(price(qos.l95_ms, rate, robot, edge, cloud, switching, objective, *weighed))
+    metrics = (qos.l95_ms, qos.violation_rate, robot, edge, cloud, switching)
+    J = float(price(*metrics, objective, *weighed(qos, objective)))
     if not math.isfinite(J):
         raise MetricError(f"J is {J!r} for {qos}; a metric is too large for its weight and target")
     return J
 
 
-def weighed_age_ms(qos: QoS, objective: Objective) -> float:
-    """Return the mean age of a QoS as J needs it: 0 if J has no term of it.
+def weighed(qos: QoS, objective: Objective) -> tuple[float, float]:
+    """Return the mean age (ms) and the price per hour of a QoS as J needs them.
 
-    Raises MetricError if it is missing.
+    A metric is 0 if J has no term of it. Raises MetricError if J has, and the metric is missing.
     """
-    if not objective.weighs_age:
-        return 0.0
-    if qos.age_ms is None:
+    age_ms = qos.age_ms if objective.weighs_age else 0.0
+    per_hour = qos.price_per_hour if objective.weighs_price else 0.0
+    if age_ms is None:
         raise MetricError("age_ms is missing; J needs it where weights.age is above 0")
-    return qos.age_ms
-
-
-def weighed_price(qos: QoS, objective: Objective) -> float:
-    """Return the price per hour of a QoS as J needs it: 0 if J has no term of it.
-
-    Raises MetricError if it is missing.
-    """
-    if not objective.weighs_price:
-        return 0.0
-    if qos.price_per_hour is None:
+    if per_hour is None:
         raise MetricError("price_per_hour is missing; J needs it where weights.price is above 0")
-    return qos.price_per_hour
+    return age_ms, per_hour
 
 
 def cost_error(

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from dwell.cost import price, tier_nodes, weighed_age_ms, weighed_price
+from dwell.cost import price, tier_nodes, weighed
 from dwell.model.problem import Problem
 from dwell.model.qos import QoS
 
@@ -40,9 +40,8 @@ class CellTerms:
     def cost(self, qos: QoS) -> float:
         """J without switching and shared nodes."""
         robot, edge, cloud = (_most(names, qos.utilisation) for names in self._own)
-        rate, objective = qos.violation_rate, self._objective
-        weighed = weighed_age_ms(qos, objective), weighed_price(qos, objective)
-        return float(price(qos.l95_ms, rate, robot, edge, cloud, 0.0, objective, *weighed))
+        metrics, objective = (qos.l95_ms, qos.violation_rate, robot, edge, cloud), self._objective
+        return float(price(*metrics, 0.0, objective, *weighed(qos, objective)))
 
     def of_one(self) -> dict[str, float]:
         """Return the cost to the cell of one busy core, or place, of each shared resource."""

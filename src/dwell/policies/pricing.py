@@ -21,8 +21,7 @@ from dwell.cost import (
     margin_errors,
     price,
     tier_nodes,
-    weighed_age_ms,
-    weighed_price,
+    weighed,
 )
 from dwell.errors import MetricError, PolicyError
 from dwell.model.frozen import FrozenDict
@@ -83,8 +82,7 @@ class Pricing:
         "_edge",
         "_robot",
         "_rows",
-        "_weighs_age",
-        "_weighs_price",
+        "_weighs",
         "candidates",
         "objective",
     )
@@ -94,7 +92,7 @@ class Pricing:
             raise PolicyError(f"objective is {objective!r}; it must be an Objective")
         self.candidates = candidates
         self.objective = objective
-        self._weighs_age, self._weighs_price = objective.weighs_age, objective.weighs_price
+        self._weighs = objective.weighs_age or objective.weighs_price
         nodes = tier_nodes(objective)
         of = objective.accelerators
         self._robot, self._edge = _shares(nodes.robot, of), _shares(nodes.edge, of)
@@ -200,8 +198,7 @@ class Pricing:
             0.0 if self._cloud is None else max(self._cloud(used)),
             switching,
             self.objective,
-            weighed_age_ms(qos, self.objective) if self._weighs_age else 0.0,
-            weighed_price(qos, self.objective) if self._weighs_price else 0.0,
+            *(weighed(qos, self.objective) if self._weighs else (0.0, 0.0)),
         )
 
     def _explain(self, qos: object, whose: str) -> NoReturn:
