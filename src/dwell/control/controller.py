@@ -341,7 +341,7 @@ class Controller:
             l95_ms, uncut_ms = seen_l95_ms(window.latency_ns, age_ns, self._censor_ms)
         else:
             uncut_ms = age_l95_ms(window.ages_ns[None])[0]
-            l95_ms = np.minimum(uncut_ms, round(self._censor_ms * 1e6) / 1e6)
+            l95_ms = np.minimum(uncut_ms, self._censor_ms)
         return float(l95_ms), missed / len(age_ns), float(uncut_ms)
 
     def seen(self, window: ClosedWindow, names: Iterable[str]) -> tuple[float, float, float]:

@@ -91,7 +91,7 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     rank, l95 = rank_of(95, count), order_statistic(seen, 95)
     # Censoring is monotone, so censoring the order statistic is censoring every latency.
     uncut_ms = l95 / 1e6
-    l95_ms = np.minimum(uncut_ms, round(censor_ms * 1e6) / 1e6)
+    l95_ms = np.minimum(uncut_ms, censor_ms)
     unfinished = latency_ns > age_ns
     lost = np.count_nonzero(unfinished, axis=-1) > count - rank
     if np.any(lost):
@@ -143,7 +143,7 @@ def mean_age_ms(
     censor_ms : float
         `Problem.censor_ms`; an age counts for no more.
     """
-    most_ns = round(censor_ms * 1e6) / 1e6 * 1e6
+    most_ns = censor_ms * 1e6
 
     def area(from_ns: float, until_ns: float) -> float:
         turn = min(max(most_ns, from_ns), until_ns)

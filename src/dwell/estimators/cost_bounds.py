@@ -100,7 +100,7 @@ class CostBounds:
         self._age_ns = np.repeat(close_ns, self._width) - real.release_ns[:-1]
         self._deadline_ns = np.minimum(self._age_ns, pipeline.deadline_ns)
         self._miss_cost = self._cost_of_a_miss()
-        self._longest_ms = round(problem.censor_ms * 1e6) / 1e6
+        self._longest_ms = problem.censor_ms
         # Times beyond the age count as the age, so sums stay within 64 bits.
         most_ns = int(self._age_ns.max()) + 1
         self._exec_ns = dict(zip(real.sites, np.minimum(real.exec_ns, most_ns), strict=True))

@@ -486,7 +486,7 @@ class _Layout:
             "grace_ns": grace_ns,
             "n_cycles": part.cycles,
             "deadline_ns": pipeline.deadline_ns,
-            "longest_ms": round(problem.censor_ms * 1e6) / 1e6,
+            "longest_ms": problem.censor_ms,
             "close_cycle": problem.window_cycles,
             "window_cycles": problem.window_cycles,
             "decide_cycles": self.decide_cycles[index],

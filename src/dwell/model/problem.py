@@ -339,6 +339,7 @@ class Problem(Displayed):
     def censor_ms(self) -> float:
         """Largest latency in J: max(4 D, 2 P), at least L_max; J cuts longer latencies to it.
 
+        It is a whole number of nanoseconds, as all latencies are.
         If a chain's data age counts as latency: max(4 max_age, or 4 D without max_age, 2 n P), n
         being the rate of the chain's last task. docs/concepts.md explains the reason.
         """
@@ -348,8 +349,8 @@ class Problem(Displayed):
             every = pipeline.rates[chain.target]
             usual_ms = chain.max_age_ms if chain.is_bounded else usual_ms
         bound_ms = max(4 * usual_ms, 2 * every * pipeline.period_ms)
-        bound_ms = max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
-        return min(bound_ms, NEVER_NS / 1e6)
+        longest_ms = max(bound_ms, cap_ms) if math.isfinite(cap_ms) else bound_ms
+        return round(min(longest_ms * 1e6, NEVER_NS)) / 1e6
 
     @property
     def shadow_fraction(self) -> float:
