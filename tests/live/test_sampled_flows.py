@@ -170,6 +170,26 @@ def test_without_a_direct_link_there_is_no_value_until_the_next_message() -> Non
     require_never_older(log.samples)
 
 
+def test_the_first_job_after_a_return_gets_no_value_from_before_the_move() -> None:
+    world, log = logged(sampling(waited=False))
+    for placement in ("AWAY", "LOC", "AWAY", "LOC"):
+        world.run(300)
+        assert world.order(placement) == ""
+    world.run(100)
+    require_never_older(log.samples)
+
+
+def test_a_task_with_sampled_inputs_alone_runs_no_more_where_it_was() -> None:
+    away = {"on": "E", "initial": "AWAY"}
+    world, log = logged(sampling(waited=False, controller=away))
+    world.run(300)
+    assert world.order("LOC") == ""
+    world.run(2 * P_MS)
+    before = len(log.inputs)
+    world.run(10 * P_MS)
+    assert len(log.inputs) - before == 10
+
+
 def test_a_task_with_sampled_inputs_alone_is_released_like_a_source() -> None:
     world, log = logged(sampling(waited=False))
     world.run(500)

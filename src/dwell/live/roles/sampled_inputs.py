@@ -36,11 +36,16 @@ class SampledInputs:
         }
         self._forwards = forwards
         self._values: Inputs = {}
-        # Node of the task under the newest stamp, and the highest cycles passed on, by flow and, if
-        # they were sent, by node.
-        self._at = place.node
+        # Node of the task under the newest stamp, and this stamp's run, cycle and term.
+        self._at, self._newest = place.node, (-1, -1, -1)
+        # Highest cycles passed on, by flow and, if they were sent, by node.
         self._left: dict[str, tuple[int, int]] = {}
         self._sent: dict[tuple[str, str], tuple[int, int]] = {}
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the task runs on another node."""
+        return self._at != self._place.node
 
     def subscriptions(self) -> Iterable[str]:
         """Key expressions to subscribe to."""
@@ -52,7 +57,7 @@ class SampledInputs:
     def receive(self, sample: Arrival, now_ns: int) -> None:
         """Process a stamp, or a value from an old node; raise a LiveError if invalid."""
         if self._place.channel(sample) is channels.STAMPED:
-            self._stamped(self._place.read(channels.STAMPED, sample))
+            self.stamped(self._place.read(channels.STAMPED, sample))
             return
         header, node = self._place.header(sample), sample.key.rpartition("/")[2]
         if header is None:
@@ -74,13 +79,22 @@ class SampledInputs:
             self._forward(source)
         return True
 
-    def newest(self) -> Inputs:
-        """Return the values for a job that begins now."""
+    def newest(self, stamp: Stamp) -> Inputs:
+        """Return the values for a job with a stamp that begins now."""
+        if stamp.term:  # not a source's guess
+            self.stamped(stamp)
         return dict(self._values)
 
-    def _stamped(self, stamp: Stamp) -> None:
-        placed = self._place.problem.candidates.get(stamp.placement)
-        if placed is None or placed.first[self._task] == self._at:
+    def stamped(self, stamp: Stamp) -> None:
+        """Follow the task to its node under a stamp, unless a newer one is known."""
+        placed, order = (
+            self._place.problem.candidates.get(stamp.placement),
+            (*stamp.key, stamp.term),
+        )
+        if placed is None or order <= self._newest:
+            return
+        self._newest = order
+        if placed.first[self._task] == self._at:
             return
         self._at = placed.first[self._task]
         if self._at == self._place.node:

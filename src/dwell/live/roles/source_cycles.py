@@ -55,6 +55,10 @@ class SourceCycles:
         header, _ = self._waiting.pop(cycle, (None, 0))
         self._last = header or self._last
 
+    def leave(self) -> None:
+        """Guess no stamp before the next one, because the task runs on another node."""
+        self._guessed = self._guesses
+
     def _begins_ns(self, header: Header) -> int:
         return self._offsets.from_reference(self._place.node, header.stamp.released_ns)[0]
 

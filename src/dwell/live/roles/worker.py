@@ -187,6 +187,8 @@ class Worker:
                     self.transfer.receive(sample)
                 case channels.STAMPED | channels.VALUE:
                     self.samples.receive(sample, now_ns)
+                    if self._source is not None and self.samples.is_away:
+                        self._source.leave()
                 case channels.DONE:
                     done = self.place.completion(sample)
                     if self.copies.completed(done):
@@ -389,7 +391,7 @@ class Worker:
         self.busy_since_ns = now_ns
         self._busy_cycle = job.header.stamp.cycle
         if not (job.shadow or job.values):
-            job.values = self.samples.newest()
+            job.values = self.samples.newest(job.header.stamp)
         if not job.shadow:
             self.book.ended(job.headers, TAKEN)
         return job
