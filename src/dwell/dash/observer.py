@@ -25,6 +25,7 @@ from dwell.live.failures import start_thread
 from dwell.live.host.operator_client import OperatorClient
 from dwell.live.log import printable
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle
+from dwell.live.roles.data_ages import DataAges
 from dwell.live.roles.role import Pulse
 from dwell.live.wire import channels
 from dwell.live.wire.local_addresses import running_elsewhere
@@ -45,7 +46,7 @@ LEAST_ASK_S, MOST_ASK_S = 0.1, 0.5
 LATE_S = 1.0
 
 #: Outcomes of a cycle that an observer can distinguish.
-OUTCOMES = ("actuated", "not_applied", "behind", "stale", "replaced", "lost", "untold")
+OUTCOMES = ("actuated", "not_applied", "behind", "stale", "replaced", "lost", "untold", "idle")
 
 EventKind: TypeAlias = Literal["move", "guard", "refused", "pin", "drain", "health"]
 
@@ -206,6 +207,7 @@ class Observer:
             self._renew = KeyRenewal(keyring.folder, self, self._pulse, self._connected).step
         self._offsets = self._place.offsets()
         self._ledger = Ledger(problem, self._offsets)
+        self._ages = DataAges(problem, self._ledger)
         self._deadline_ns = problem.pipeline.deadline_ns
         # First release of the run, on the stamper's clock.
         self._origin_ns = 0
@@ -332,7 +334,8 @@ class Observer:
             return
         if before is None or stamp.run != before.run:
             self._origin_ns = self._begin_ns(stamp, before)
-        cycle = LiveCycle.of(stamp, self._origin_ns)
+        idle = self._ledger.due.is_idle(stamp.cycle)
+        cycle = LiveCycle.of(stamp, self._origin_ns, idle=idle)
         cycle.group_ns = stamp.group_ns
         self._open[cycle.key] = cycle
         self._newest = cycle, time.monotonic_ns()
@@ -350,13 +353,13 @@ class Observer:
         return stamp.released_ns
 
     def _settle(self) -> None:
-        """Close the cycles that are complete or too late."""
+        """Close the cycles that are over or too late."""
         if self._newest is None:
             return
         late_ns = self._deadline_ns + round(LATE_S * 1e9)
         for key, cycle in list(self._open.items()):
-            complete = self._ledger.complete(cycle)
-            if not complete and self._newest[0].at_ns - cycle.at_ns <= late_ns:
+            over = self._ledger.is_over(cycle)
+            if not over and self._newest[0].at_ns - cycle.at_ns <= late_ns:
                 continue
             del self._open[key]
             self._ledger.settle(cycle)
@@ -366,6 +369,8 @@ class Observer:
         # The outcome is unknown if the relay has sent nothing for LATE_S.
         quiet_ns = time.monotonic_ns() - self._told_ns
         cycle.deaf = quiet_ns > round(LATE_S * 1e9)
+        self._ages.judge([cycle], NEVER_NS, self._ages.known)
+        self._ages.closed([cycle])
         outcome, completed = _outcome(cycle), cycle.latency_ns < NEVER_NS
         # The time of completion is unknown until the clocks are compared.
         known = not cycle.untold and (completed or outcome not in ("actuated", "behind"))
@@ -461,6 +466,8 @@ def _why(answers: Sequence[Mapping[str, Any]], new: str, *, guarded: bool) -> st
 
 def _outcome(cycle: LiveCycle) -> str:
     """Return the outcome of a cycle, one of `OUTCOMES`."""
+    if cycle.idle:
+        return "idle"
     words: Sequence[str] = [done.outcome for done in cycle.reports.values()]
     # The worst outcome that a sink reports.
     for word in ("not_applied", "stale", "behind"):

@@ -29,6 +29,7 @@ OUTCOMES = {
     "replaced": "replaced",
     "lost": "dropped",
     "untold": "dropped",
+    "idle": "idle",
 }
 
 T = TypeVar("T")

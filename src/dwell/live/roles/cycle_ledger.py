@@ -315,6 +315,12 @@ class Ledger:
         """Whether every due sink has reported a cycle; false for an idle cycle."""
         return not cycle.idle and self.due.sinks(cycle.number) <= cycle.reports.keys()
 
+    def is_over(self, cycle: LiveCycle) -> bool:
+        """Whether a cycle is complete or idle, and its sampled messages have arrived."""
+        arrived = {(source, target) for source, target, _ in cycle.arrivals}
+        sampled = {flow for flow in self._sampled if self.due.runs(flow[0], cycle.number)}
+        return (cycle.idle or self.complete(cycle)) and sampled <= arrived
+
     def is_replaced(self, cycle: LiveCycle) -> bool:
         """Whether a later cycle has replaced a job that a due sink waits for."""
         return any(self.due.is_needed(task, cycle.number) for task, _ in cycle.replaced)
