@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from dwell.cellfile import from_document
 from dwell.model import (
     Constant,
     Execution,
@@ -90,3 +91,32 @@ def test_idle_cycles_have_missed_nothing() -> None:
         StaticFleet(**length).waiting(fleet.changed(policy="OFF")),
     ):
         assert ms(waited) == {("resource", "E"): pytest.approx(20 * (3 + 4))}
+
+
+def test_old_data_have_waited_in_their_cycle_of_origin() -> None:
+    """Each second cell's detection waits 15 ms for the first's; its fourth use is 60 ms old."""
+    document = {
+        "dwell": 1,
+        "name": "loop",
+        "period_ms": 10,
+        "window_cycles": 20,
+        "warmup_windows": 1,
+        "nodes": {"R": {"tier": "robot"}, "E": {"tier": "edge", "scheduler": "fifo"}},
+        "links": [{"from": "R", "to": "E", "both_ways": True, "delay_ms": 0}],
+        "tasks": {
+            "camera": {"every": 4, "on": {"R": {"exec_ms": 0}}},
+            "imu": {"on": {"R": {"exec_ms": 0}}},
+            "detect": {"on": {"E": {"exec_ms": 15}}},
+            "control": {"on": {"R": {"exec_ms": 0}}},
+        },
+        "flows": [
+            {"from": "camera", "to": "detect"},
+            {"from": "detect", "to": "control", "sampled": True},
+            {"from": "imu", "to": "control"},
+        ],
+        "chains": {"see-act": {"from": "camera", "to": "control", "max_age_ms": 55}},
+        "candidates": {"OFF": {}},
+    }
+    fleet = fleet_of((from_document(document), 2)).changed(policy="OFF")
+    length = {"seed": 1, "duration_ns": fleet.duration_ns(2)}
+    assert ms(StaticFleet(**length).waiting(fleet)) == {("resource", "E"): pytest.approx(5 * 15)}

@@ -39,6 +39,19 @@ def over_age(
     return over
 
 
+def stale_origins(pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice) -> Ints:
+    """Return the origin of each actuation in some cycles whose age is over its chain's bound."""
+    found = [np.empty(0, np.int64)]
+    for number, chain in enumerate(pipeline.chains.values()):
+        if chain.is_bounded:
+            at_ns = arrays.tables.actuated_ns[0, number, cycles]
+            origin = arrays.tables.actuated_from[0, number, cycles].astype(np.int64)
+            found.append(
+                origin[(at_ns < NEVER_NS) & (at_ns - release_ns[origin] > chain.max_age_ns)]
+            )
+    return np.concatenate(found)
+
+
 def due_misses(
     pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice
 ) -> NDArray[np.bool_]:

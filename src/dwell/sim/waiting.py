@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dwell.kernels.arrays import CellArrays, flow_columns
 from dwell.kernels.codes import CycleOutcome
-from dwell.kernels.over_age import over_age
+from dwell.kernels.over_age import over_age, stale_origins
 from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 from dwell.model.number_arrays import Ints
@@ -24,6 +24,8 @@ Waiting: TypeAlias = Counter[tuple[str, str]]
 def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiting:
     """Sum the waiting times of the missed cycles after the warm-up; needs the log of all jobs.
 
+    If a cycle's data are over the age limit of a chain, their cycle of origin counts, too.
+
     The wait for a resource is the time from readiness to completion minus the execution time. The
     wait for a link is the time until the message is sent, plus the time of repeated attempts.
     """
@@ -32,7 +34,9 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     missed = tables.latency_ns[0, :last] > pipeline.deadline_ns
     missed |= over_age(pipeline, real.release_ns, arrays, slice(last))
     missed &= tables.outcome[0, :last] != CycleOutcome.IDLE
-    cycles = first + np.flatnonzero(missed[first:])
+    # Old data waited in the cycle that they descend from.
+    origins = stale_origins(pipeline, real.release_ns, arrays, slice(first, last))
+    cycles = np.concatenate((first + np.flatnonzero(missed[first:]), origins))
     logs, _, arrivals, _ = arrays.logs()
     log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_columns(problem)]
     stamps = tables.stamps[0, cycles]
