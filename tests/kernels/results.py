@@ -20,6 +20,9 @@ from tests.cells.generated import Scheduler, random_problem, random_stamps
 
 ROOT = Path(__file__).parents[2]
 EVERY: tuple[Scheduler, ...] = ("fair", "fifo", "priority", "turns")
+#: Random cells. Number 12 would take twice as long as all others together, and reaches no line or
+#: branch of the kernel that the others and the kernel's tests do not reach.
+CELLS = tuple(case for case in range(40) if case != 12)
 
 
 class Stamps:
@@ -67,7 +70,7 @@ def examples() -> Iterator[bytes]:
 
 def random_cells() -> Iterator[bytes]:
     """Yield the tables of random cells that move in every window."""
-    for case in range(40):
+    for case in CELLS:
         rng = Random(case)
         problem = random_problem(rng, schedulers=EVERY, orders=bool(case % 2))
         policy = Stamps(random_stamps(rng, problem, 13))
