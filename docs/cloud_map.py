@@ -1,13 +1,13 @@
 """Map of robot, edge and cloud: `python -m docs.cloud_map STUDY`.
 
-STUDY is the folder of `dwell study examples/studies/clouds.yaml`. The command writes
-docs/images/cloud-map.csv and cloud-map.svg, and prints how often each place wins. A place wins
-clearly if the 95 % interval of its difference to the next place excludes 0.
+STUDY is the folder of `dwell study examples/studies/clouds.yaml`. The command writes cloud-map.csv
+and cloud-map.svg to docs/images, or to the folder `--out`, and prints how often each place wins. A
+place wins clearly if the 95 % interval of its difference to the next place excludes 0.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -20,7 +20,6 @@ from dwell.study import open_study, paired_difference
 from reproduction.evidence.measured_on import measured_on
 
 IMAGES = Path(__file__).parent / "images"
-DATA, DRAWING = IMAGES / "cloud-map.csv", IMAGES / "cloud-map.svg"
 #: Columns of the study's parameters.
 DELAY, JITTER, EVERY = (
     f"parameter.{name}"
@@ -138,15 +137,21 @@ def table(won: pl.DataFrame) -> Iterator[str]:
         yield f"| {row} | {interval_ms} ms | " + " | ".join(counts) + f" | {here.height} |"
 
 
-def main(folder: str) -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Write the map and its data, and print the table."""
-    won = pl.DataFrame(list(winners(open_study(folder).runs)))
-    won.write_csv(DATA, float_precision=4)
-    DRAWING.write_text(printed_svg(figure(won), BOTH_PT), encoding="utf-8")
+    parser = argparse.ArgumentParser(prog="python -m docs.cloud_map", description=__doc__)
+    parser.add_argument("study", help="folder of the study")
+    parser.add_argument("--out", type=Path, default=IMAGES, help="folder of the files")
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    won = pl.DataFrame(list(winners(open_study(given.study).runs)))
+    won.write_csv(given.out / "cloud-map.csv", float_precision=4)
+    drawing = printed_svg(figure(won), BOTH_PT)
+    (given.out / "cloud-map.svg").write_text(drawing, encoding="utf-8")
     print(measured_on())
     print("\nPoints that each place wins (clearly):\n")
     print("\n".join(table(won)))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main()

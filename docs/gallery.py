@@ -58,6 +58,21 @@ PICTURES = (
         "capacity.svg",
         "capacity.csv",
     ),
+    Picture(
+        "replicas",
+        ("python -m docs.replicas --out figures",),
+        "replicas.svg",
+        "replicas.csv",
+    ),
+    Picture(
+        "cloud-map",
+        (
+            "dwell study examples/studies/clouds.yaml",
+            "python -m docs.cloud_map studies/clouds --out figures",
+        ),
+        "cloud-map.svg",
+        "cloud-map.csv",
+    ),
 )
 
 
@@ -69,7 +84,7 @@ def make(picture: Picture, folder: Path) -> tuple[Path, Path]:
         subprocess.run(
             command.split(),
             cwd=folder,
-            env={**os.environ, "PATH": path},
+            env={**os.environ, "PATH": path, "PYTHONPATH": str(ROOT)},
             check=True,
             stdout=subprocess.DEVNULL,
         )

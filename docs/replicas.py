@@ -1,13 +1,12 @@
 """Figure and table of "When does a second copy pay?": `python -m docs.replicas`, a minute.
 
-It simulates examples/replicas.yaml for several `after_ms`, writes docs/images/replicas.csv and
-replicas.svg, and prints the table. `--check` compares the data, and writes nothing.
+It simulates examples/replicas.yaml for several `after_ms`, writes replicas.csv and replicas.svg to
+docs/images, or to the folder `--out`, and prints the table.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from dwell.study import mean_interval
 
 ROOT = Path(__file__).parents[1]
 CELL = ROOT / "examples" / "replicas.yaml"
-DATA, DRAWING = (ROOT / "docs" / "images" / f"replicas.{end}" for end in ("csv", "svg"))
+IMAGES = ROOT / "docs" / "images"
 AFTER_MS = (0.0, 2.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 9.5, 10.0, 11.0, 12.0, 13.5, 15.0)
 ALONE, TWO = "ONE alone", "two copies"
 LATE, SENT = "cycles over 15 ms, %", "second copies, % of the cycles"
@@ -72,23 +71,19 @@ def figure(data: pl.DataFrame) -> Figure:
     return Figure("replicas", "When does a second copy pay?", {"rows": data}, draw)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the figure and its data, or compare the data; return 1 if they differ."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the figure and its data, and print the table."""
     parser = argparse.ArgumentParser(prog="python -m docs.replicas", description=__doc__)
-    parser.add_argument("--check", action="store_true", help="compare the data, write nothing")
-    given = parser.parse_args(arguments)
+    parser.add_argument("--out", type=Path, default=IMAGES, help="folder of the files")
+    folder = parser.parse_args(arguments).out
+    folder.mkdir(parents=True, exist_ok=True)
     data = rows(windows=1000, seeds=5)
-    text = data.write_csv(float_precision=6)
-    if given.check:
-        differs = DATA.read_text(encoding="utf-8") != text
-        print("other data: replicas" if differs else "same data", file=sys.stderr)
-        return int(differs)
-    DATA.write_text(text, encoding="utf-8")
-    DRAWING.write_text(printed_svg(figure(data), BOTH_PT), encoding="utf-8")
+    data.write_csv(folder / "replicas.csv", float_precision=6)
+    drawing = printed_svg(figure(data), BOTH_PT)
+    (folder / "replicas.svg").write_text(drawing, encoding="utf-8")
     for line in data.iter_rows():
         print(*line, sep="\t")
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
