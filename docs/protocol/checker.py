@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -55,20 +54,35 @@ class ViolationError(AssertionError):
 
 @dataclass(frozen=True, slots=True)
 class Explored(Generic[State]):
-    """All states, each with the steps that lead on from it."""
+    """All states, numbered from the nearest on.
 
-    steps: dict[State, list[Step[State]]]
-    came_from: dict[State, tuple[State, str] | None]
-    depth: int
+    Numbers are what makes a million steps quick: to look a state up takes its whole content.
 
-    def way(self, state: State) -> list[str]:
+    Parameters
+    ----------
+    numbers : dict
+        The number of each state.
+    came_from : list
+        By number, the first way to a state: the number of the state before, and the step's label.
+    leads_to : list
+        By number, the states that steps without a fault lead to.
+    depths : list of int
+        By number, the steps of the shortest way.
+    """
+
+    numbers: dict[State, int]
+    came_from: list[tuple[int, str] | None]
+    leads_to: list[list[int]]
+    depths: list[int]
+
+    def way(self, number: int) -> list[str]:
         """Return the labels of the shortest way to a state."""
         found = []
-        came = self.came_from[state]
+        came = self.came_from[number]
         while came is not None:
-            state, label = came
+            number, label = came
             found.append(label)
-            came = self.came_from[state]
+            came = self.came_from[number]
         return found[::-1]
 
 
@@ -112,21 +126,26 @@ def explore(
     MemoryError
         If there are more states than `most`.
     """
-    explored: Explored[State] = Explored({}, {initial: None}, 0)
-    waiting = deque([(initial, 0)])
-    depth = 0
-    while waiting:
-        state, depth = waiting.popleft()
-        steps = explored.steps[state] = list(successors(state))
-        for step in steps:
+    explored: Explored[State] = Explored({initial: 0}, [None], [], [0])
+    numbers, came_from, depths = explored.numbers, explored.came_from, explored.depths
+    states = [initial]
+    # New states are appended meanwhile.
+    for number, state in enumerate(states):
+        leads_to: list[int] = []
+        for step in successors(state):
             if step.wrong:
-                raise ViolationError(step.wrong, (*explored.way(state), step.label))
-            if step.state not in explored.came_from:
-                explored.came_from[step.state] = state, step.label
-                waiting.append((step.state, depth + 1))
-        if len(explored.came_from) > most:
+                raise ViolationError(step.wrong, (*explored.way(number), step.label))
+            after = numbers.setdefault(step.state, len(states))
+            if after == len(states):
+                states.append(step.state)
+                came_from.append((number, step.label))
+                depths.append(depths[number] + 1)
+            if not step.fault:
+                leads_to.append(after)
+        explored.leads_to.append(leads_to)
+        if len(states) > most:
             raise MemoryError(f"more than {most} states")
-    return Explored(explored.steps, explored.came_from, depth)
+    return explored
 
 
 @_uncollected()
@@ -135,19 +154,18 @@ def stuck(explored: Explored[State], good: Callable[[State], bool]) -> list[Stat
 
     Where there are none, a cell that is treated fairly recovers once the faults are over.
     """
-    back: dict[State, list[State]] = {state: [] for state in explored.steps}
-    for state, steps in explored.steps.items():
-        for step in steps:
-            if not step.fault:
-                back[step.state].append(state)
-    saved = {state for state in explored.steps if good(state)}
-    waiting = deque(saved)
+    back: list[list[int]] = [[] for _ in explored.leads_to]
+    for number, leads_to in enumerate(explored.leads_to):
+        for after in leads_to:
+            back[after].append(number)
+    saved = [good(state) for state in explored.numbers]
+    waiting = [number for number, is_saved in enumerate(saved) if is_saved]
     while waiting:
-        for state in back[waiting.popleft()]:
-            if state not in saved:
-                saved.add(state)
-                waiting.append(state)
-    return [state for state in explored.steps if state not in saved]
+        for number in back[waiting.pop()]:
+            if not saved[number]:
+                saved[number] = True
+                waiting.append(number)
+    return [state for state, is_saved in zip(explored.numbers, saved, strict=True) if not is_saved]
 
 
 def without(
@@ -163,7 +181,7 @@ def without(
         except ViolationError as violation:
             return violation
         if lost := stuck(found, good):
-            return ViolationError("there is no way back", tuple(found.way(lost[0])))
+            return ViolationError("there is no way back", tuple(found.way(found.numbers[lost[0]])))
     return None
 
 
@@ -177,7 +195,8 @@ def report(
     for successors in cases:
         found = explore(initial, successors)
         lost = len(stuck(found, good))
-        print(f"{len(found.steps)} states, {found.depth} steps deep; from {lost} no way back")
+        deep = found.depths[-1]
+        print(f"{len(found.numbers)} states, {deep} steps deep; from {lost} no way back")
     for rule, text in rules.items():
         wrong = without(rule, initial, cases, good)
         print(f"\nwithout {rule!r} ({text}): {wrong or 'nothing goes wrong'}")
