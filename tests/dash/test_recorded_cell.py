@@ -15,6 +15,7 @@ from dwell.errors import RunError
 from dwell.model import Weights
 from dwell.study.verdict import verdict_of
 from tests.cells.late_cycles import late_run, without_late_cycles
+from tests.cells.rated import idle_cell
 from tests.dash.recorded import small_run
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -50,6 +51,18 @@ def test_cycles_after_the_last_window_are_not_shown(tmp_path: Path) -> None:
     )
     assert found == expected
     assert found[0]["missed"] == found[0]["cycles"] == 20
+
+
+def test_idle_cycles_are_neither_counted_nor_lost(tmp_path: Path) -> None:
+    run = dwell.simulate(idle_cell(), seed=1, windows=4)
+    idle = run.cycles["outcome"].cast(pl.String) == "idle"
+    cell = RecordedCell(run.save(tmp_path / "idle"))
+    whole = cell.described()
+    view = cell.view(whole["begin"], whole["end"], 50)
+    assert 0 < idle.sum() < len(idle) == view["released"]
+    assert view["cycles"] == whole["cycles"] == sum(view["bins"]["count"]) == (~idle).sum()
+    never_done = run.cycles["latency_ns"].is_null() & ~idle
+    assert sum(view["bins"]["lost"]) == never_done.sum()
 
 
 def test_a_state_is_what_was_known_then(cell: RecordedCell, run: dwell.Run) -> None:

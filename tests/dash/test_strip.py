@@ -24,6 +24,7 @@ def strips(draw: st.DrawFn) -> Strip:
         missed=random.random(count) < draw(st.sampled_from([0.0, 0.01, 0.3, 1.0])),
         placement=random.integers(0, draw(st.integers(1, 4)), count).astype(np.int32),
         number=np.arange(count),
+        due=random.random(count) < draw(st.sampled_from([0.1, 1.0])),
     )
 
 
@@ -35,11 +36,12 @@ def test_every_cycle_and_every_miss_is_in_a_bin(
     view = strip.view(begin, end, bins)
     inside = (begin <= strip.at) & (strip.at < end)
     found = view["bins"]
-    assert view["cycles"] == sum(found["count"]) == inside.sum()
+    assert view["released"] == inside.sum()
+    assert view["cycles"] == sum(found["count"]) == strip.due[inside].sum()
     assert view["missed"] == sum(found["missed"]) == strip.missed[inside].sum()
-    assert sum(found["lost"]) == np.isnan(strip.latency_ms[inside]).sum()
+    assert sum(found["lost"]) == np.isnan(strip.latency_ms[inside & strip.due]).sum()
     assert len({len(column) for column in found.values()}) == 1
-    assert len(found["at"]) <= bins or view["cycles"] <= bins
+    assert len(found["at"]) <= bins or view["released"] <= bins
     known = strip.latency_ms[inside & ~np.isnan(strip.latency_ms)]
     highs = [high for high in found["high"] if high is not None]
     assert max(highs, default=0.0) == np.round(max(known, default=0.0), 3)
@@ -63,6 +65,7 @@ def test_a_long_run_takes_little_room_at_any_zoom() -> None:
         missed=random.random(count) < 0.05,
         placement=random.integers(0, 3, count).astype(np.int32),
         number=np.arange(count),
+        due=np.ones(count, np.bool_),
     )
     for share in (1.0, 0.1, 0.01, 0.0001):
         view = strip.view(0.0, share * count / 30, 1_500)
@@ -86,7 +89,8 @@ def test_cycles_that_come_late_stand_where_they_were_released() -> None:
     def strip(at: list[float]) -> Strip:
         count = len(at)
         zeros = np.zeros(count, np.int32)
-        return Strip(np.array(at), np.ones(count), zeros.astype(bool), zeros, np.arange(count))
+        never = zeros.astype(bool)
+        return Strip(np.array(at), np.ones(count), never, zeros, np.arange(count), ~never)
 
     joined = strip([1.0, 2.0, 4.0]).followed_by(strip([3.0, 5.0]), most=4)
     assert joined.at.tolist() == [2.0, 3.0, 4.0, 5.0]

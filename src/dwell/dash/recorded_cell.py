@@ -155,6 +155,7 @@ class _Contents:
             missed=cycles["missed"][counted].astype(bool, copy=False),
             placement=placement_codes(cycles.names("placement")[counted], self._candidates),
             number=self._cycle,
+            due=~cycles.names("outcome")[counted].equal("idle"),
         )
         size, period_s = self.problem.window_cycles, self.problem.pipeline.period_ms / 1e3
         self.window = size * period_s if unit == "s" else float(size)
@@ -195,7 +196,7 @@ class _Contents:
             "begin": float(self.strip.at[0]),
             "end": float(self.strip.at[-1]) + cycle,
             "about": {name: str(value) for name, value in about.items() if value is not None},
-            "cycles": len(self.strip.at),
+            "cycles": int(self.strip.due.sum()),
             "missed": int(self.strip.missed.sum()),
             "windows": len(self.windows.number),
             "has_jobs": self.run.has_jobs,

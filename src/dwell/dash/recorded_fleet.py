@@ -329,6 +329,7 @@ def _member(place: int, cell: FleetCell, run: Run, phase_ms: float, aim: float) 
         missed=~(l95_ms <= pipeline.deadline_ms),
         placement=windows.placement,
         number=windows.number,
+        due=np.ones(len(windows.number), np.bool_),
     )
     counted = windows.rates[windows.counts]
     rate = float(counted.mean()) if len(counted) else np.nan

@@ -36,6 +36,8 @@ class Strip:
     placement : integer array, shape (n,)
         Index of the placement in the cell's candidates.
     number : int64 array, shape (n,)
+    due : bool array, shape (n,)
+        False for idle cycles, in which no sink is due.
     """
 
     at: Floats
@@ -43,6 +45,7 @@ class Strip:
     missed: NDArray[np.bool_]
     placement: NDArray[np.integer[Any]]
     number: NDArray[np.int64]
+    due: NDArray[np.bool_]
 
     def followed_by(self, other: Strip, most: int) -> Strip:
         """Return both strips merged in order of `at`; only the last `most` cycles."""
@@ -62,19 +65,20 @@ class Strip:
         Returns
         -------
         dict
-            Numbers of ``cycles`` and ``missed``; ``bins``: ``at`` and ``number`` of the first
-            cycle, ``count``, ``low`` and ``high`` (ms; None if all cycles are lost), ``missed``,
-            ``lost``; ``ribbon``: ``begin``, ``end`` and ``placement`` of stretches. With too many
-            stretches ``exact`` is false, and the ribbon has, for each placement, the bins that
-            contain it.
+            Numbers of ``released`` cycles, of ``cycles`` in which a sink is due, and of ``missed``
+            cycles; ``bins``: ``at`` and ``number`` of the first cycle, ``count`` of due cycles,
+            ``low`` and ``high`` (ms; None if all cycles are lost), ``missed``, ``lost``;
+            ``ribbon``: ``begin``, ``end`` and ``placement`` of stretches. With too many stretches
+            ``exact`` is false, and the ribbon has, for each placement, the bins that contain it.
         """
         rows = self.rows(begin, end)
         at, latency_ms, missed = self.at[rows], self.latency_ms[rows], self.missed[rows]
-        starts = bin_starts(at, begin, end, bins)
-        counts = np.diff(np.append(starts, len(at)))
-        lost = np.isnan(latency_ms)
+        starts, due = bin_starts(at, begin, end, bins), self.due[rows]
+        counts = _reduced(np.add, due.astype(np.int64), starts)
+        lost = np.isnan(latency_ms) & due
         return {
-            "cycles": len(at),
+            "released": len(at),
+            "cycles": int(due.sum()),
             "missed": int(missed.sum()),
             "bins": {
                 "at": plain(at[starts], 4),
@@ -131,17 +135,19 @@ def difference_of_misses(
     Returns
     -------
     dict
-        ``begin``, ``end`` of each bin and ``points`` of per cent; None if a strip has no cycle in
-        the bin.
+        ``begin``, ``end`` of each bin and ``points`` of per cent; None if a strip has no due
+        cycle in the bin.
     """
     step = length * max(1, -(-(end - begin) // (length * bins)))
     edges = np.arange(begin // step, -(-end // step) + 1) * step
     shares = []
     for strip in (one, other):
         rows = np.searchsorted(strip.at, edges)
-        missed = np.concatenate(([0], np.cumsum(strip.missed)))[rows]
+        missed, due = (
+            np.concatenate(([0], np.cumsum(of)))[rows] for of in (strip.missed, strip.due)
+        )
         with np.errstate(invalid="ignore", divide="ignore"):
-            shares.append(np.diff(missed) / np.diff(rows))
+            shares.append(np.diff(missed) / np.diff(due))
     return {
         "begin": plain(edges[:-1], 4),
         "end": plain(edges[1:], 4),

@@ -62,6 +62,7 @@ class WatchedCell:
             missed=np.array([one.missed for one in cycles], bool),
             placement=np.array([self._codes[one.placement] for one in cycles], np.int32),
             number=np.array([one.number for one in cycles], np.int64),
+            due=np.array([one.outcome != "idle" for one in cycles], bool),
         )
 
     def _lines_of(self, windows: Sequence[ObservedWindow]) -> tuple[Floats, dict[str, Floats]]:

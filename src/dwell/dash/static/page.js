@@ -53,7 +53,7 @@ class CellView {
     for (const other of this.page.cells) if (other !== this) other.charts.rescale();
     panel.events(this.root, this.cell, view, this.page);
     const part = this.root.querySelector(".gantt");
-    const few = view.cycles > 0 && view.cycles <= FEW_CYCLES && this.cell.has_jobs;
+    const few = view.released > 0 && view.released <= FEW_CYCLES && this.cell.has_jobs;
     part.hidden = !few;
     if (few) gantt(part, this.cell, this.page, await get("/jobs", { cell: this.i, begin, end }));
   }
