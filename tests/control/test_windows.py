@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import dwell
-from dwell.control import final_l95_ms
+from dwell.control import final_l95_ms, reactions
 from dwell.control.windows import missed_cycles, seen_l95_ms, utilisation
 from dwell.model import Constant, Execution, Node, Task
 from dwell.model.instants import NEVER_NS
@@ -99,3 +99,14 @@ def test_the_cost_of_a_placement_that_loses_cycles_does_not_grow_with_its_window
         cost[W] = float(np.mean(np.array(costs, float)))
     mean = sum(cost.values()) / len(cost)
     assert all(abs(value / mean - 1) < 0.05 for value in cost.values()), cost
+
+
+def test_a_release_waits_for_the_first_actuation_in_time_that_knows_a_later_one() -> None:
+    # The actuation of place 1 comes last; those of places 3 and 4 never do.
+    at_ns = np.array([10, 50, 30, NEVER_NS, NEVER_NS])
+    newest = np.array([-1, 4, 6, 9, 9])
+    cycles, places = reactions(at_ns, newest, 2, 0)
+    assert (cycles.tolist(), places.tolist()) == ([0, 2, 4], [2, 2, 2])
+    cycles, places = reactions(at_ns[:2], newest[:2], 2, 2)
+    assert (cycles.tolist(), places.tolist()) == ([2], [1])
+    assert [len(one) for one in reactions(at_ns[3:], newest[3:], 1, 0)] == [0, 0]

@@ -6,7 +6,7 @@ the simulator's kernel (``metrics.h``) therefore compute the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,8 +160,8 @@ def mean_age_ms(
     return total / float(close_ns - open_ns) / 1e6
 
 
-def reactions(at_ns: Ints, newest: Ints, every: int, since: int) -> Iterator[tuple[int, int]]:
-    """Yield releases of a chain's first task, and the places of the actuations that end their wait.
+def reactions(at_ns: Ints, newest: Ints, every: int, since: int) -> tuple[Ints, Ints]:
+    """Return releases of a chain's first task, and places of the actuations that end their wait.
 
     A release waits for the first actuation that descends from a later cycle of the task.
 
@@ -174,12 +174,17 @@ def reactions(at_ns: Ints, newest: Ints, every: int, since: int) -> Iterator[tup
         Cycles from one release of the task to its next.
     since : int
         First release that waits.
+
+    Returns
+    -------
+    cycles, places : int64 array
+        Ascending cycles of the releases; places in `at_ns`.
     """
-    for place in np.lexsort((np.arange(len(at_ns)), at_ns)).tolist():
-        if at_ns[place] >= NEVER_NS:
-            return
-        yield from ((cycle, place) for cycle in range(since, int(newest[place]), every))
-        since = max(since, int(newest[place]))
+    order = np.argsort(at_ns, kind="stable")
+    order = order[at_ns[order] < NEVER_NS]
+    known = np.maximum.accumulate(newest[order])
+    cycles = np.arange(since, known.max(initial=since), every)
+    return cycles, order[np.searchsorted(known, cycles, side="right")]
 
 
 def utilisation(core_ns: Floats, capacity: Floats, span_ns: Ints | int) -> Floats:

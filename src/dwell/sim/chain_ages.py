@@ -37,7 +37,14 @@ def reaction_l95_ms(
     at_ns, newest = (
         table[0, number, cycles] for table in (tables.actuated_ns, tables.actuated_newest)
     )
-    found = np.array([*reactions(at_ns, newest, every, 0)], np.int64).reshape(-1, 2)
-    after_ns = at_ns[found[:, 1]] - realisation.release_ns[found[:, 0]]
-    inside = [(found[:, 1] >= first) & (found[:, 1] < first + width) for first in firsts.tolist()]
-    return np.array([final_l95_ms(after_ns[one]) if one.any() else np.inf for one in inside])
+    cycle, place = reactions(at_ns, newest, every, 0)
+    after_ns = at_ns[place] - realisation.release_ns[cycle]
+    # Windows with equally many reaction times have their L95 at the same rank.
+    order = np.argsort(place, kind="stable")
+    begin, end = np.searchsorted(place[order], (firsts, firsts + width))
+    result = np.full(len(firsts), np.inf)
+    for count in set((end - begin).tolist()) - {0}:
+        alike = np.flatnonzero(end - begin == count)
+        inside = order[begin[alike, None] + np.arange(count)]
+        result[alike] = final_l95_ms(after_ns[inside])
+    return result

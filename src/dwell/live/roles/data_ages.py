@@ -150,10 +150,11 @@ class DataAges:
         since = before.newest
         if since is None:
             since = -(-first.number // every) * every
+        waits = reactions(at_ns, newest_of, every, since)
         return [
             int(at_ns[place])
             - released_ns.get(one, first.at_ns + (one - first.number) * self._period_ns)
-            for one, place in reactions(at_ns, newest_of, every, since)
+            for one, place in zip(*(found.tolist() for found in waits), strict=True)
         ]
 
     def seen(
