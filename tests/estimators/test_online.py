@@ -220,6 +220,20 @@ def test_a_node_that_is_still_at_work_is_not_down(kind: Kind) -> None:
     assert shown["OFF"].violation_rate < 1.0
 
 
+@every
+@pytest.mark.parametrize(("used", "is_down"), [(1.0, False), (0.1, True)])
+def test_a_full_node_on_which_jobs_get_little_is_not_down(
+    kind: Kind, used: float, is_down: bool
+) -> None:
+    """Foreign threads that leave own jobs little of a node; a node that is down has none."""
+    estimator = kind(cell())
+    estimator.learn(lost_on_e(2))
+    load = {"R": 0.0, "E": used}
+    own = {"R": 0.0, "E": 0.005}
+    estimator.estimate(observed=QoS(1.0, 0.0, load), incumbent="OFF", own=own)
+    assert estimator.present.down == ({"E"} if is_down else set())
+
+
 def test_a_node_that_goes_down_and_comes_back() -> None:
     problem = cell(scenario=[NodeDisturbance("E", at_s=4.0, for_s=4.0, down=True)])
     settings = once(ControllerSettings(on="R"), problem.window_cycles)

@@ -160,7 +160,7 @@ class Online(CellEstimator):
         foreign = self.profile.see(observed, incumbent, own)
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
-            self._look_at_nodes(evidence, foreign, own, incumbent)
+            self._look_at_nodes(evidence, foreign, observed, own, incumbent)
             self._take_in_pending()
         otherwise = self._otherwise()
         names = self._names(otherwise)
@@ -299,7 +299,12 @@ class Online(CellEstimator):
         return cost_error(played.error or NO_ERROR, self.problem.objective, played.age_error_ms)
 
     def _look_at_nodes(
-        self, evidence: Evidence, seen: Foreign, own: Mapping[str, float], incumbent: str
+        self,
+        evidence: Evidence,
+        seen: Foreign,
+        observed: QoS,
+        own: Mapping[str, float],
+        incumbent: str,
     ) -> None:
         """Update the foreign threads of nodes, and the nodes that are down, from a window."""
         known = self._player.prices[incumbent]
@@ -311,11 +316,13 @@ class Online(CellEstimator):
             if changed:
                 self._has_changed = True
                 self._regimes += 1
-        down = frozenset(self._down_nodes(evidence, own))
+        down = frozenset(self._down_nodes(evidence, observed.utilisation, own))
         if down != self._down:
             self._down, self._has_changed = down, True
 
-    def _down_nodes(self, evidence: Evidence, own: Mapping[str, float]) -> Iterator[str]:
+    def _down_nodes(
+        self, evidence: Evidence, used: Mapping[str, float], own: Mapping[str, float]
+    ) -> Iterator[str]:
         """Yield idle nodes that have lost at least two jobs since their last completed job."""
         limit_ns = evidence.close_ns - self._patience_ns
         if not evidence.rows.unknown(int(limit_ns.max()))[0]:
@@ -340,7 +347,9 @@ class Online(CellEstimator):
             idle_ns = evidence.close_ns - max(ended_ns[node], min(after, default=0))
             capacity = self.problem.fabric.nodes[node].capacity
             works = own[node] * capacity * span_ns >= 0.5 * idle_ns
-            if len(after) >= 2 and not works:
+            # A node that is down has no foreign load, either.
+            is_used = used[node] * span_ns >= span_ns - 0.5 * idle_ns
+            if len(after) >= 2 and not (works or is_used):
                 yield node
 
     def _names(self, otherwise: Mapping[Part, Floats]) -> list[str]:
