@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import pytest
 
 import dwell
 from dwell.control import Controller
-from dwell.estimators import Evidence
+from dwell.estimators import Corrected, Evidence
 from dwell.estimators.foreign_threads import (
     WINDOWS,
     ForeignThreads,
     Level,
     Stretches,
 )
+from dwell.estimators.measured import Part, Site
 from dwell.model import (
     Bursts,
     Constant,
@@ -30,6 +31,7 @@ from dwell.model import (
     Task,
 )
 from dwell.model.fabric import Scheduler
+from dwell.model.qos import QoS
 from dwell.sim.engine import PlayedCell, play_cells
 from tests.cells.generated import make_problem
 from tests.estimators.windows import Row, window
@@ -266,6 +268,49 @@ def test_few_jobs_say_nothing_nor_what_is_not_known_of_them() -> None:
     cycles = known.cycles
     for unknown in (replace(cycles, start_ns=None), replace(cycles, work_ns=None)):
         assert Stretches(problem).level(known.with_instants(unknown, None), "E") is None
+
+
+class Remembering(Corrected):
+    """`Corrected` that remembers the foreign threads of E at each decision."""
+
+    def __deepcopy__(self, memo: object) -> Remembering:
+        return self
+
+    def start(self, problem: Problem) -> None:
+        """Forget all of them."""
+        super().start(problem)
+        self.beyond: list[float] = []
+        self.demands_ms: dict[Part, float] = {}
+
+    def estimate(
+        self, *, observed: QoS, incumbent: str, own: Mapping[str, float]
+    ) -> dict[str, QoS]:
+        """Estimate, and remember."""
+        estimates = super().estimate(observed=observed, incumbent=incumbent, own=own)
+        self.beyond.append(self.present.threads.get("E", 0.0))
+        self.demands_ms = {part: float(ms.mean()) for part, ms in self.present.demands.items()}
+        return estimates
+
+
+@pytest.mark.parametrize("every", [1, 2])
+@pytest.mark.parametrize("stress", [0, 1, 4])
+def test_a_backlog_of_earlier_cycles_is_no_foreign_thread(stress: int, every: int) -> None:
+    """A task needs 110 of 100 ms on the core of E. Windows soon have none of its jobs."""
+    slow = Task("B", {"E": Execution(Constant(110.0 * every))}, every=every)
+    clock = Task("C", {"E": Execution(Constant(1.0))})
+    problem = make_problem(
+        [Node("E", "edge", 1)],
+        [slow, clock],
+        scenario=[NodeDisturbance("E", 0.0, stress_threads=stress)] if stress else [],
+        window_cycles=20,
+    )
+    estimator = Remembering(problem)
+    dwell.simulate(
+        problem, scenario="disturbed", policy="LOC", estimator=estimator, seed=1, windows=30
+    )
+    assert estimator.beyond[-5:] == pytest.approx([stress] * 5, abs=0.1)
+    waits_ms = estimator.demands_ms.get(Site("C", "E"), 1.0)
+    assert waits_ms == pytest.approx(1.0, abs=0.1)
 
 
 # ------------------------------------------------------------------- next to jobs of other cells

@@ -11,7 +11,7 @@ import dwell
 from dwell.estimators import Corrected, Evidence
 from dwell.estimators.evidence import Instants
 from dwell.estimators.foreign_threads import Level, Stretches
-from dwell.estimators.measured import Meter
+from dwell.estimators.measured import Meter, UsedCores
 from dwell.model import Problem
 from tests.cells.examples import EXAMPLES
 from tests.cells.generated import Scheduler, random_problem
@@ -68,16 +68,19 @@ def test_random_windows_say_the_same_in_both(seed: int) -> None:
     for _ in range(4):
         evidence = random_evidence(rng, problem)
         foreign = {name: float(rng.integers(0, 5)) / 2 for name in problem.fabric.nodes}
+        full: dict[str, UsedCores] = {}
         for name in problem.fabric.nodes:
-            found = stretches.level(evidence, name)
-            assert found == window_jobs.level(problem, evidence, name)
+            own, others = (rng.uniform(0.0, 2.0, 2) * rng.integers(0, 2)).tolist()
+            used = full[name] = own, others
+            found = stretches.level(evidence, name, used)
+            assert found == window_jobs.level(problem, evidence, name, used=used)
             beside = random_beside(rng, problem, evidence)
             evidence.rows.beside = beside
-            found = Stretches(problem, {name}).level(evidence, name)
+            found = Stretches(problem, {name}).level(evidence, name, used)
             assert found == window_jobs.level(problem, evidence, name, beside)
         np.testing.assert_array_equal(
-            meter.waited_ns(evidence, foreign),
-            window_jobs.work_with_waits(problem, evidence, (), foreign),
+            meter.waited_ns(evidence, foreign, full),
+            window_jobs.work_with_waits(problem, evidence, (), foreign, full),
         )
 
 
@@ -103,7 +106,7 @@ class Compared(Corrected):
                 self.levels.append(level)
         np.testing.assert_array_equal(
             self.meter.waited_ns(evidence, threads),
-            window_jobs.work_with_waits(self.problem, evidence, (), threads),
+            window_jobs.work_with_waits(self.problem, evidence, (), threads, {}),
         )
         super().learn(evidence)
 

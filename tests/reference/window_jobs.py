@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.estimators import Evidence
-from dwell.estimators.evidence import Instants
+from dwell.estimators.evidence import NOT_DUE, Instants
 from dwell.estimators.foreign_threads import Level
-from dwell.estimators.measured import cores_of
+from dwell.estimators.measured import NOT_FULL, UsedCores, cores_of
 from dwell.estimators.pool import newest
 from dwell.model import Node, Problem
 
@@ -79,6 +79,39 @@ def known_jobs(
     return Jobs(*columns) if is_used else None
 
 
+def used_before(problem: Problem, evidence: Evidence, node: Node, own: float) -> float:
+    """Mean cores of a full node that jobs of earlier cycles used, where a task has a backlog.
+
+    Parameters
+    ----------
+    own : float
+        Mean cores that all jobs of the cell used on the node in the window; 0 if it is not full.
+    """
+    candidates, known_ns, has_backlog = list(problem.candidates.values()), 0, False
+    for instants, placement in (
+        (evidence.cycles, evidence.placement),
+        (evidence.shadows, evidence.shadow_placement),
+    ):
+        if instants is None:
+            continue
+        assert instants.work_ns is not None
+        for column, (name, task) in enumerate(problem.pipeline.tasks.items()):
+            mine = [
+                row
+                for row, code in enumerate(placement.tolist())
+                if code >= 0
+                and candidates[code][name] == node.name
+                and task.on[node.name].accelerator is None
+            ]
+            end_ns, work_ns = instants.end_ns[mine, column], instants.work_ns[mine, column]
+            known_ns += int(np.maximum(work_ns[end_ns >= 0], 0).sum())
+            is_due = bool((end_ns != NOT_DUE).any())
+            has_backlog |= instants is evidence.cycles and is_due and not (end_ns >= 0).any()
+    if own == 0.0 or not has_backlog:
+        return 0.0
+    return max(own - known_ns / (len(evidence.placement) * problem.pipeline.period_ns), 0.0)
+
+
 def used_by(jobs: Jobs) -> tuple[Floats, Floats]:
     """Instants at which jobs begin and end, and the cores that they use from each of them on."""
     at_ns = np.concatenate((jobs.start_ns, jobs.end_ns))
@@ -100,9 +133,19 @@ def used_beside(jobs: Jobs, others: Jobs) -> Floats:
 
 
 def work_with_waits(
-    problem: Problem, evidence: Evidence, shared: tuple[str, ...], foreign: Mapping[str, float]
+    problem: Problem,
+    evidence: Evidence,
+    shared: tuple[str, ...],
+    foreign: Mapping[str, float],
+    full: Mapping[str, UsedCores],
 ) -> Ints:
-    """Core time of own jobs, with what most jobs of their task waited for."""
+    """Core time of own jobs, with what most jobs of their task waited for.
+
+    Parameters
+    ----------
+    full : mapping of str to tuple of (own, others)
+        Used cores of each full node.
+    """
     cycles = evidence.cycles
     assert cycles.work_ns is not None
     work_ns = cycles.work_ns.copy()
@@ -120,7 +163,8 @@ def work_with_waits(
             if jobs is None:
                 continue
             threads = foreign.get(node.name, 0.0) + (node.bursts.threads if node.bursts else 0.0)
-            alone_ns = alone_with_waits(node, threads, jobs)
+            earlier = used_before(problem, evidence, node, full.get(node.name, NOT_FULL)[0])
+            alone_ns = alone_with_waits(node, threads, jobs, earlier)
             for column, name in enumerate(problem.pipeline.tasks):
                 of_task = jobs.task == column
                 if placed[name] == node.name and of_task.any():
@@ -132,8 +176,11 @@ def work_with_waits(
     return work_ns
 
 
-def alone_with_waits(node: Node, foreign: float, jobs: Jobs) -> Floats:
-    """Times alone of jobs on a node whose jobs share its cores evenly; with waits, if most wait."""
+def alone_with_waits(node: Node, foreign: float, jobs: Jobs, earlier: float = 0.0) -> Floats:
+    """Times alone of jobs on a node whose jobs share its cores evenly; with waits, if most wait.
+
+    `earlier` is the mean number of cores that jobs of earlier cycles used.
+    """
     alone_ns = jobs.alone_ns.copy()
     tasks = [jobs.task == one for one in sorted(set(jobs.task.tolist()))]
     taken_ns = jobs.end_ns - jobs.start_ns
@@ -143,7 +190,7 @@ def alone_with_waits(node: Node, foreign: float, jobs: Jobs) -> Floats:
     by_task = np.argsort(jobs.task, kind="stable")
     at_ns, used = used_by(Jobs(*(column[by_task] for column in jobs)))
     # Cores for each that a job wants: what it would have had, had it waited for nothing.
-    share = np.minimum(node.spare / np.maximum(used + foreign, 1e-9), 1.0)
+    share = np.minimum(max(node.spare - earlier, 0.0) / np.maximum(used + foreign, 1e-9), 1.0)
     had_ns = during(jobs, at_ns, share)
     for of in longer:
         if is_longer(had_ns[of], jobs.alone_ns[of]):
@@ -160,12 +207,18 @@ def is_longer(taken_ns: Floats, alone_ns: Floats) -> bool:
 
 
 def level(
-    problem: Problem, evidence: Evidence, name: str, beside: Ints | None = None
+    problem: Problem,
+    evidence: Evidence,
+    name: str,
+    beside: Ints | None = None,
+    used: UsedCores = NOT_FULL,
 ) -> Level | None:
     """Foreign threads beside which jobs ran since the last change, but those of bursts.
 
     Parameters
     ----------
+    used : tuple of (own, others)
+        Used cores of a full node.
     beside : int64 array, shape (n, parts, tasks, 2), optional
         Of a node that cells share, `WindowRows.beside`.
     """
@@ -183,10 +236,12 @@ def level(
             return None
     slowed = jobs.taken_ns / jobs.alone_ns
     spare = node.spare if node.quota is None else node.capacity
+    earlier = 0.0
     if node.scheduler != "fair":
         threads = slowed * spare - node.cores
     else:
         if beside is None:
+            earlier = used_before(problem, evidence, node, used[0])
             mine = used_beside(jobs, jobs)
             own = None if before is None else used_beside(jobs, before)
         else:
@@ -196,7 +251,7 @@ def level(
         threads = slowed * spare - mine
         if own is not None:
             found = behind if beside is None else behind_all
-            threads = found(slowed, spare, mine, own)
+            threads = found(slowed, max(spare - earlier, 0.0), mine, own)
     # Some jobs leave others room, and take no longer for it: they say only how many there are at
     # most. Each task's jobs since its last change are looked at by themselves.
     since = [since_change(jobs, threads, task) for task in sorted(set(jobs.task.tolist()))]
@@ -207,7 +262,12 @@ def level(
     off = math.sqrt(place * (1.0 - place) / len(ordered))
     places = (max(place - off, 0.0), place, min(place + off, 1.0))
     low, beyond, high = (float(ordered[round(one * (len(ordered) - 1))]) for one in places)
-    return Level(max(round(beyond, 3), 0.0), (high - low) / 2, bool(told))
+    error = (high - low) / 2
+    if earlier > 0.0 and not is_behind:
+        # Jobs of earlier cycles and foreign threads get the same cores for each thread.
+        share = used[1] / (used[1] + earlier)
+        beyond, error = beyond * share, error * share
+    return Level(max(round(beyond, 3), 0.0), error, bool(told))
 
 
 def since_change(jobs: Jobs, threads: Floats, task: float) -> Ints:

@@ -11,7 +11,13 @@ from functools import partial
 from typing import NamedTuple
 
 from dwell.estimators.evidence import Evidence
-from dwell.estimators.measured import cores_of, cores_on, message_columns
+from dwell.estimators.measured import (
+    NOT_FULL,
+    UsedCores,
+    cores_of,
+    cores_on,
+    message_columns,
+)
 from dwell.kernels.jobs import NodeJobs, SlowedJobs
 from dwell.model.fabric import Node
 from dwell.model.pipeline import Execution
@@ -113,11 +119,12 @@ class Stretches:
         self._problem, self._shared = problem, shared
         self._on: dict[str, SlowedJobs] = {}
 
-    def level(self, evidence: Evidence, name: str) -> Level | None:
+    def level(self, evidence: Evidence, name: str, used: UsedCores = NOT_FULL) -> Level | None:
         """Return the estimate from the jobs on a node; None if they allow no estimate.
 
         Own jobs count if there are enough; if not, shadow jobs do, provided that they share the
-        remaining cores evenly with foreign threads.
+        remaining cores evenly with foreign threads. `used` has the used cores of a full node:
+        they show jobs of earlier cycles, which the evidence lacks, if a task has a backlog.
         """
         rows, is_shared = evidence.rows, name in self._shared
         node = self._problem.fabric.nodes[name]
@@ -126,7 +133,7 @@ class Stretches:
         ):
             return None
         shadows = evidence.shadows_share
-        told = self._jobs_on(name).level(rows, shadows=shadows, is_shared=is_shared)
+        told = self._jobs_on(name).level(rows, used, shadows=shadows, is_shared=is_shared)
         if told is None:
             return None
         threads, error, is_slowed = told
@@ -140,7 +147,8 @@ class Stretches:
             bursts = 0.0 if node.bursts is None else node.bursts.share
             cores = cores_on(self._problem, node, partial(_turns, node))
             is_fair = node.scheduler == "fair"
-            jobs = NodeJobs(cores, is_fair, node.cores, spare, bursts)
+            period_ns = self._problem.pipeline.period_ns
+            jobs = NodeJobs(cores, is_fair, node.cores, spare, period_ns, bursts)
             flows = message_columns(self._problem, next(iter(self._problem.candidates.values())))
             self._on[name] = SlowedJobs(jobs, len(flows))
         return self._on[name]

@@ -103,7 +103,7 @@ class Learning(Online):
             of = [part for part in self._pools if isinstance(part, Message) and part.link in links]
             for part in of:
                 self._pools[part].reset()
-            self._meter.measure(evidence, self._threads)
+            self._meter.measure(evidence, self._threads, self._full)
             measured = self._meter.found_parts
             changed = [part for part in changed if part not in of]
             changed += self._learn(cycles, [part for part in of if part in measured])

@@ -16,6 +16,7 @@ from dwell.estimators.spans import patience_ns
 from dwell.kernels.jobs import NodeJobs, WaitingJobs
 from dwell.kernels.meter import CyclesLayout, PartTimes, WindowRows
 from dwell.model.fabric import Node
+from dwell.model.frozen import FrozenDict
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.pipeline import Execution, Pipeline
 from dwell.model.placement import Copy, Placement, Replicas
@@ -24,6 +25,10 @@ from dwell.model.problem import Problem
 Rows: TypeAlias = slice | Ints
 
 EVERY = slice(None)
+#: Cores that the cell's jobs used and that foreign threads used on a node, means over a window.
+UsedCores: TypeAlias = tuple[float, float]
+#: Used cores of a node that was not full.
+NOT_FULL: UsedCores = 0.0, 0.0
 #: Fewest foreign threads, in addition to bursts, that slow jobs down by interference.
 BESIDE = 0.5
 
@@ -147,8 +152,9 @@ class Meter:
         self._sharing = [(one.name, one.bursts.threads if one.bursts else 0) for one in sharing]
         self._waiting = WaitingJobs(
             [
-                NodeJobs(cores_on(problem, one, partial(cores_of, one)), True, one.cores, one.spare)
+                NodeJobs(cores, True, one.cores, one.spare, problem.pipeline.period_ns)
                 for one in sharing
+                for cores in [cores_on(problem, one, partial(cores_of, one))]
             ],
             len(message_columns(problem, self._placements[0])),
         )
@@ -179,8 +185,16 @@ class Meter:
         self.measure(evidence, foreign or {})
         return self._by_part(self._demands)
 
-    def measure(self, evidence: Evidence, foreign: Mapping[str, float]) -> None:
-        """Compute the demands of a window in `found`, without the mapping of `demands`."""
+    def measure(
+        self,
+        evidence: Evidence,
+        foreign: Mapping[str, float],
+        full: Mapping[str, UsedCores] = FrozenDict(),
+    ) -> None:
+        """Compute the demands of a window in `found`, without the mapping of `demands`.
+
+        `full` has the used cores of each full node.
+        """
         self._cost[:] = self._usual_cost
         for number, node in self._interfered:
             # The declared demands include the interference of bursts.
@@ -189,9 +203,11 @@ class Meter:
         rows = evidence.rows
         if any(rows.unknown(evidence.close_ns - self._patience_ns)[1:]):
             rows = self._with_work(evidence, foreign).rows
-        self._take_apart(self._demands, evidence, self._with_waits(rows, foreign))
+        self._take_apart(self._demands, evidence, self._with_waits(rows, foreign, full))
 
-    def _with_waits(self, rows: WindowRows, foreign: Mapping[str, float]) -> WindowRows:
+    def _with_waits(
+        self, rows: WindowRows, foreign: Mapping[str, float], full: Mapping[str, UsedCores]
+    ) -> WindowRows:
         """Add to the work of jobs the waits that most jobs of their task have in common.
 
         A job of a real system may wait for something that no cell declares: a device, the network,
@@ -200,11 +216,17 @@ class Meter:
         """
         # A burst may last as long as the job.
         threads = [foreign.get(name, 0.0) + most for name, most in self._sharing]
-        return self._waiting.added(rows, threads)
+        own_cores = [full.get(name, NOT_FULL)[0] for name, _ in self._sharing]
+        return self._waiting.added(rows, threads, own_cores)
 
-    def waited_ns(self, evidence: Evidence, foreign: Mapping[str, float]) -> Ints:
+    def waited_ns(
+        self,
+        evidence: Evidence,
+        foreign: Mapping[str, float],
+        full: Mapping[str, UsedCores] = FrozenDict(),
+    ) -> Ints:
         """Return the core time of own jobs with their waits, nanoseconds, shape (n, tasks)."""
-        return self._with_waits(evidence.rows, foreign).columns(shadow=False)[4].copy()
+        return self._with_waits(evidence.rows, foreign, full).columns(shadow=False)[4].copy()
 
     def _with_work(self, evidence: Evidence, foreign: Mapping[str, float]) -> Evidence:
         """Add estimates of unknown core times."""

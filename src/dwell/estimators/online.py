@@ -15,12 +15,21 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 
-from dwell.cost import cost_error, hamming
+from dwell.cost import SATURATED, cost_error, hamming
 from dwell.estimators.cell_terms import CellTerms
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.foreign_threads import ForeignThreads, Stretches
 from dwell.estimators.link_rates import Rate
-from dwell.estimators.measured import Message, Meter, Part, groups, job_columns, parts_of
+from dwell.estimators.measured import (
+    NOT_FULL,
+    Message,
+    Meter,
+    Part,
+    UsedCores,
+    groups,
+    job_columns,
+    parts_of,
+)
 from dwell.estimators.present import Present
 from dwell.estimators.prices import SEED
 from dwell.estimators.profile import Foreign, Profile, mean_ms
@@ -76,6 +85,8 @@ class Online(CellEstimator):
         #: The last window until `estimate` uses it, and until its demands are learnt.
         self._evidence: Evidence | None = None
         self._pending: Evidence | None = None
+        #: Used cores of the nodes that were full in that window.
+        self._full: Mapping[str, UsedCores] = {}
         #: Whether the measured conditions have changed, or have new samples.
         self._has_changed = self._has_grown = False
 
@@ -123,12 +134,13 @@ class Online(CellEstimator):
         """Keep a window; its demands are learnt after the state of its nodes."""
         self._take_in_pending()
         self._evidence = self._pending = evidence
+        self._full = {}
 
     def _take_in_pending(self) -> None:
         """Learn from the demands of the last window, once per window."""
         evidence, self._pending = self._pending, None
         if evidence is not None:
-            self._meter.measure(evidence, self._threads)
+            self._meter.measure(evidence, self._threads, self._full)
             self._take_in(evidence)
 
     @property
@@ -160,6 +172,7 @@ class Online(CellEstimator):
         foreign = self.profile.see(observed, incumbent, own)
         evidence, self._evidence = self._evidence, None
         if evidence is not None:
+            self._full = dict(self._used_cores(observed, foreign, own))
             self._look_at_nodes(evidence, foreign, observed, own, incumbent)
             self._take_in_pending()
         otherwise = self._otherwise()
@@ -298,6 +311,15 @@ class Online(CellEstimator):
         played = self._player.played(name)
         return cost_error(played.error or NO_ERROR, self.problem.objective, played.age_error_ms)
 
+    def _used_cores(
+        self, observed: QoS, foreign: Foreign, own: Mapping[str, float]
+    ) -> Iterator[tuple[str, UsedCores]]:
+        """Yield every node that was full in a window, with its used cores."""
+        for name, node in self.problem.fabric.nodes.items():
+            if observed.utilisation[name] >= SATURATED:
+                others = max(foreign.shares[name] * node.capacity - node.background, 0.0)
+                yield name, (own[name] * node.capacity, others)
+
     def _look_at_nodes(
         self,
         evidence: Evidence,
@@ -310,7 +332,8 @@ class Online(CellEstimator):
         known = self._player.prices[incumbent]
         for name, foreign in self._foreign.items():
             usual, deviation = known.foreign[name], known.foreign_deviation[name]
-            level = partial(self._stretches.level, evidence, name)
+            used = self._full.get(name, NOT_FULL)
+            level = partial(self._stretches.level, evidence, name, used)
             is_full = name in seen.full
             changed = foreign.see(seen.shares[name], usual, deviation, level, is_full=is_full)
             if changed:

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 
+#include "codes.h"
 #include "export.h"
 #include "rows.h"
 
@@ -142,6 +143,32 @@ bool runs_on(const NodeJobs& node, i64 candidate) {
   return std::any_of(cores, cores + node.n_tasks, [](f64 one) { return one > 0.0; });
 }
 
+// Mean cores of a full node that jobs of earlier cycles used, because a task has a backlog: no job
+// of the window completed. 0 without such a task.
+f64 used_before(const NodeJobs& node, const Window& window) {
+  if (node.own == 0.0) return 0.0;
+  i64 known_ns = 0;
+  bool has_backlog = false;
+  for (i64 begin = 0; begin < window.width; begin += width_of(node)) {
+    for (i64 task = 0; task < node.n_tasks; ++task) {
+      i64 due = 0, completed = 0;
+      for (i64 i = 0; i < window.n; ++i) {
+        const i64* cycle = window.rows + i * window.width + begin;
+        if (cycle[0] < 0 || node.cores[cycle[0] * node.n_tasks + task] == 0.0) continue;
+        const i64* end_ns = cycle + 1 + node.n_tasks + task;
+        due += *end_ns != kNotDue ? 1 : 0;
+        if (*end_ns < 0) continue;
+        completed += 1;
+        known_ns += std::max<i64>(end_ns[node.n_tasks + node.n_flows], 0);
+      }
+      has_backlog |= begin == 0 && due > 0 && completed == 0;
+    }
+  }
+  if (!has_backlog) return 0.0;
+  const f64 span_ns = static_cast<f64>(window.n) * node.period_ns;
+  return std::max(node.own - static_cast<f64>(known_ns) / span_ns, 0.0);
+}
+
 // The lowest candidate above `after` in the column `begin` of cycles, or of shadows; -1 for none.
 i64 next_candidate(const Window& window, i64 begin, i64 after) {
   i64 next = -1;
@@ -182,10 +209,10 @@ i64 next_candidate(const Window& window, i64 begin, i64 after) {
   });
   if (!any) return;
   const Uses uses = uses_of(all, uses_out);
+  const f64 spare = std::max(node.spare - used_before(node, window), 0.0);
   // Share of its wanted cores that a job gets if it waits only for other running threads.
-  integrate(uses, [&](f64 used) {
-    return std::min(node.spare / std::max(used + node.foreign, 1e-9), 1.0);
-  });
+  integrate(uses,
+            [&](f64 used) { return std::min(spare / std::max(used + node.foreign, 1e-9), 1.0); });
   const auto had_ns = [&](const RanJob& job) { return area_during(uses, job); };
   each_task([&](const RanJob* first, i64 n) {
     if (n < kJobs || !is_longer(first, n, scratch, took_ns)) return;
@@ -334,6 +361,9 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   Jobs jobs = own;
   bool any = false;
   const bool is_behind = own.n < kJobs;
+  const bool counts = node->is_fair != 0 && beside == nullptr;
+  const f64 earlier = counts ? used_before(*node, *window) : 0.0;
+  const f64 left = std::max(node->spare - earlier, 0.0);
   if (is_behind) {
     if (shadows == 0 || window->width <= width_of(*node)) return 0;
     jobs = jobs_on(*node, *window, width_of(*node), beside, behind, &any);
@@ -341,7 +371,7 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   }
   const auto same = [](f64 used) { return used; };
   Uses uses{uses_out, 0}, before{uses_out + 2 * room, 0};
-  if (node->is_fair != 0 && beside == nullptr) {
+  if (counts) {
     integrate(uses = uses_of(jobs, uses_out), same);
     if (is_behind) integrate(before = uses_of(own, uses_out + 2 * room), same);
     has_own = has_own && is_behind;
@@ -350,14 +380,14 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   }
   for (RanJob& job : jobs) {
     job.slowed = job.taken_ns() / job.alone_ns;
-    if (node->is_fair != 0 && beside == nullptr) {
+    if (counts) {
       job.used = used_beside(uses, job);
       job.above = used_beside(before, job);
     }
     const f64 mine = node->is_fair != 0 ? job.used : node->n_cores;
     const auto of_shadow = beside == nullptr ? threads_behind : threads_behind_all;
-    job.threads = has_own ? of_shadow(job.slowed, node->spare, mine, job.above)
-                          : job.slowed * node->spare - mine;
+    job.threads =
+        has_own ? of_shadow(job.slowed, left, mine, job.above) : job.slowed * node->spare - mine;
   }
   const bool is_slowed = keep_newest(jobs, values);
   for (i64 i = 0; i < jobs.n; ++i) values[i] = jobs.first[i].threads;
@@ -371,6 +401,12 @@ DWELL_EXPORT i64 dwell_level(const NodeJobs* node, const Window* window, const i
   };
   out[0] = at(place);
   out[1] = (at(std::min(place + off, 1.0)) - at(std::max(place - off, 0.0))) / 2;
+  // The threads are foreign or of jobs of earlier cycles; both get the same cores per thread.
+  if (!is_behind && earlier > 0.0) {
+    const f64 share = node->others / (node->others + earlier);
+    out[0] *= share;
+    out[1] *= share;
+  }
   return is_slowed ? 2 : 1;
 }
 

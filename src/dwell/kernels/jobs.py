@@ -28,6 +28,7 @@ class NodeJobs(NamedTuple):
         Whether jobs share the cores as threads of equal weight.
     n_cores, spare : float
         Cores of the node, and cores without its background load.
+    period_ns : int
     bursts : float
         Share of the time with bursts.
     """
@@ -36,12 +37,14 @@ class NodeJobs(NamedTuple):
     is_fair: bool
     n_cores: float
     spare: float
+    period_ns: int
     bursts: float = 0.0
 
     def row(self, flows: int) -> Any:
         """Return the kernel's row; it is valid as long as `cores` exists."""
         head = self.cores.shape[1], flows, self.cores.ctypes.data, self.is_fair
-        return structs()["NodeJobs"](*head, self.n_cores, self.spare, 0.0, self.bursts)
+        of_node = self.n_cores, self.spare, self.period_ns, 0.0, self.bursts, 0.0, 0.0
+        return structs()["NodeJobs"](*head, *of_node)
 
 
 class WaitingJobs:
@@ -64,13 +67,16 @@ class WaitingJobs:
         # A copy needs its own addresses.
         return WaitingJobs, (self._nodes, self._flows)
 
-    def added(self, window: WindowRows, foreign_threads: Sequence[float]) -> WindowRows:
+    def added(
+        self, window: WindowRows, foreign_threads: Sequence[float], own_cores: Sequence[float]
+    ) -> WindowRows:
         """Return a window with the typical wait of each task's jobs in the work of own jobs.
 
+        `own_cores` has the mean cores that the cell's jobs used on each full node; 0 for others.
         The next call overwrites the result.
         """
-        for row, threads in zip(self._rows, foreign_threads, strict=True):
-            row.foreign = threads
+        for row, threads, own in zip(self._rows, foreign_threads, own_cores, strict=True):
+            row.foreign, row.own = threads, own
         if self._out.table.shape != window.table.shape:
             self._out = WindowRows(np.empty_like(window.table), window.tasks, window.flows)
         of, out = byref(window.row), byref(self._out.row)
@@ -90,12 +96,20 @@ class SlowedJobs:
         return SlowedJobs, (self._node, self._flows)
 
     def level(
-        self, window: WindowRows, *, shadows: bool, is_shared: bool = False
+        self,
+        window: WindowRows,
+        used: tuple[float, float],
+        *,
+        shadows: bool,
+        is_shared: bool = False,
     ) -> tuple[float, float, bool] | None:
         """Estimate the number of foreign threads since their last change.
 
         Parameters
         ----------
+        used : tuple of (own, others)
+            Mean cores that the cell's jobs used, and that foreign threads used, on a full node; 0
+            if it is not full.
         shadows : bool
             Whether shadow jobs count if own jobs are too few.
         is_shared : bool
@@ -106,6 +120,7 @@ class SlowedJobs:
         tuple of (threads, error, is_slowed), or None
             See `dwell.estimators.foreign_threads.Level`; None if the jobs allow no estimate.
         """
+        self._row.own, self._row.others = used
         out, beside = (c_double * 2)(), window.beside_address if is_shared else None
         of = byref(self._row), byref(window.row), beside, shadows
         found = _level()(*of, self._scratch.address(window), out)

@@ -292,11 +292,13 @@ struct Crossing;  // of meter.cpp
 #define DWELL_WINDOW(field) field(i64*, rows) field(i64, n) field(i64, width)
 
 // The jobs of a node (jobs.cpp): `cores` of each candidate and task, 0 for a task on another node;
-// cores of the node, and cores left by its background; foreign threads next to jobs; the share of
-// the time with bursts.
+// cores of the node, and cores left by its background; the period; foreign threads next to jobs; the
+// share of the time with bursts; mean cores that the cell's jobs used, and that foreign threads used,
+// on a full node in the window (0 if it is not full).
 #define DWELL_NODE_JOBS(field)                                                                   \
   field(i64, n_tasks) field(i64, n_flows) field(const f64*, cores) field(i64, is_fair)           \
-  field(f64, n_cores) field(f64, spare) field(f64, foreign) field(f64, bursts)
+  field(f64, n_cores) field(f64, spare) field(f64, period_ns) field(f64, foreign)                \
+  field(f64, bursts) field(f64, own) field(f64, others)
 
 // The times found: up to `most` per part, and the parts in the order in which they were found.
 // If the caller wants demands instead of times, each part has a `cost`: for a job the ratio of its
