@@ -269,8 +269,9 @@ def replay(
         following = now(following_ns), kind
         while (due_ns := windows.due_ns(now(t_ns))) is not None and (due_ns, 2) < following:
             window = windows.close()
-            assert window.evidence is not None
-            evidence.append(window.evidence())
+            of = (window.recent or window).evidence
+            assert of is not None
+            evidence.append(of())
             closed.append(window)
             left = course.placement
             settle(windows, controller, window)

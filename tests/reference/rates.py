@@ -5,9 +5,10 @@ Shares no code with `dwell.model` beyond the keys of tasks and flows.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 
-from dwell.model import Flow, Pipeline
+from dwell.model import Flow, Pipeline, Problem
 from dwell.model.placement import Copy, Placement
 
 
@@ -89,3 +90,12 @@ class Rates:
             return active[task] != other[task] or any(is_apart(source) for source in before)
 
         return {task for task in self.pipeline.tasks if is_apart(task)}
+
+
+def earlier_cycles(problem: Problem) -> int:
+    """Cycles before a decision's own that its evidence has: only if a task skips cycles."""
+    pipeline, slowest = problem.pipeline, max(Rates(problem.pipeline).of.values())
+    if slowest == 1:
+        return 0
+    deadlines = math.ceil(pipeline.deadline_ms / pipeline.period_ms)
+    return min(2 * slowest, problem.window_cycles - 1) + 2 * deadlines

@@ -23,7 +23,7 @@ from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import Execution, Flow, Node, Problem, Quota, Task
 from dwell.model.placement import Copy
 from tests.reference.guard import NEVER, Guard, Proof, Wait
-from tests.reference.rates import Rates
+from tests.reference.rates import Rates, earlier_cycles
 from tests.reference.replicas import Copies, second
 
 #: Of the changes of one instant, the place of what quotas do then.
@@ -125,9 +125,10 @@ class Look:
     """The cycles of one decision: `first` to `last`, of which those from `begin` on are new.
 
     `opened` is the usage at the release of `first`, `begun` at the release of `begin`. `known` and
-    `arrived` hold the jobs and messages of the cycles from `first` on, as of the decision.
+    `arrived` hold the jobs and messages of the cycles from `earliest` on, as of the decision.
     """
 
+    earliest: int
     first: int
     begin: int
     last: int
@@ -1157,9 +1158,11 @@ class Simulation:
     def decide(self, boundary: int) -> None:
         """Look at the last W cycles under the placement, and order what the script says."""
         begin, first = boundary - self.every, max(self.since, boundary - self.problem.window_cycles)
-        known, arrived = self.known_of(first, boundary)
+        earliest = max(0, min(first, begin - earlier_cycles(self.problem)))
+        known, arrived = self.known_of(earliest, boundary)
         self.looks.append(
             Look(
+                earliest=earliest,
                 first=first,
                 begin=begin,
                 last=boundary - 1,

@@ -58,7 +58,7 @@ from tests.reference import simulator as reference_simulator
 from tests.reference.algorithm_1 import price, switching
 from tests.reference.cancelled import Cancelled
 from tests.reference.chains import over_age
-from tests.reference.rates import Rates
+from tests.reference.rates import Rates, earlier_cycles
 from tests.reference.replicas import second
 from tests.reference.simulator import (
     ITSELF,
@@ -650,7 +650,14 @@ def probe_differences(case: Case, probe: Probe, result: Result, tolerance_ns: in
         l95_ns = l95_ns_of(case, look.first, look.last + 1 - look.first, look)
         if differs(round(observed.l95_ms * 1e6), l95_ns, tolerance_ns):
             yield f"{where}: L95 {observed.l95_ms} ms, expected {l95_ns} ns"
-        yield from evidence_differences(case, evidence, look, result, tolerance_ns)
+        stretch = range(look.begin, look.last + 1)
+        yield from evidence_differences(case, evidence, look, stretch, result, tolerance_ns)
+        earlier = evidence.earlier
+        stretch = range(max(look.begin - earlier_cycles(case.problem), 0), look.begin)
+        if bool(stretch) != (earlier is not None):
+            yield f"{where}: earlier evidence {earlier}, expected {stretch}"
+        elif earlier is not None:
+            yield from evidence_differences(case, earlier, look, stretch, result, tolerance_ns)
 
 
 def seen_looks(case: Case, result: Result) -> list[Look]:
@@ -681,11 +688,17 @@ def l95_ns_of(case: Case, first: int, count: int, closed: WindowResult | Look) -
 
 
 def evidence_differences(
-    case: Case, evidence: Evidence, look: Look, result: Result, tolerance_ns: int
+    case: Case,
+    evidence: Evidence,
+    look: Look,
+    cycles: range,
+    result: Result,
+    tolerance_ns: int,
 ) -> Iterator[str]:
-    where = f"evidence of cycle {look.begin}"
+    """Compare the evidence of some cycles with what was known of them at a decision."""
+    where = f"evidence of {cycles} at cycle {look.last}"
     names = list(case.problem.candidates)
-    first, last = look.begin, look.last + 1
+    first, last = cycles.start, cycles.stop
     stamps = result.stamps[first:last]
     if evidence.close_ns != look.close_ns:
         yield f"{where}: close_ns {evidence.close_ns}, expected {look.close_ns}"
@@ -698,7 +711,8 @@ def evidence_differences(
         yield f"{where}: shadow_placement {evidence.shadow_placement}, expected {stamps}"
     assert evidence.shadows is not None
     for cell, instants in ((ITSELF, evidence.cycles), (SHADOW, evidence.shadows)):
-        for name, found, expected, matters in known_instants(case, instants, look, cell, result):
+        known = known_instants(case, instants, look, cycles, cell, result)
+        for name, found, expected, matters in known:
             assert found.shape == expected.shape
             # What is unknown in one is unknown in the other.
             same = (found < 0) == (expected < 0)
@@ -710,7 +724,7 @@ def evidence_differences(
 
 
 def known_instants(
-    case: Case, found: Instants, look: Look, cell: int, result: Result
+    case: Case, found: Instants, look: Look, cycles: range, cell: int, result: Result
 ) -> Iterator[tuple[str, NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]]:
     """What evidence says, and what was known, for each kind of instants, and what matters."""
     pipeline, rows = case.problem.pipeline, list(case.problem.pipeline.tasks)
@@ -718,13 +732,12 @@ def known_instants(
     if case.problem.replicas:
         rows += map(second, pipeline.tasks)
         flows += [(flow, second(flow.source), second(flow.target)) for flow in pipeline.flows]
-    cycles = range(look.begin, look.last + 1)
-    rates = Rates(pipeline)
+    first, rates = cycles.start, Rates(pipeline)
     due = [[rates.is_due(row.partition("/")[0], k) for row in rows] for k in cycles]
     ready, ended, started, work = (np.where(due, -1, NOT_DUE) for _ in range(4))
     for (whose, cycle, row), job in look.known.items():
         if whose == cell and cycle in cycles:
-            at = cycle - look.begin, rows.index(row)
+            at = cycle - first, rows.index(row)
             ready[at] = job.ready_ns
             if job.start_ns is not None:
                 started[at] = job.start_ns
@@ -747,15 +760,15 @@ def known_instants(
     for k in cycles if cell == ITSELF else ():
         copies = Cancelled(case.problem, look, result, k, int(case.real.release_ns[k]))
         for i, row in enumerate(rows):
-            jobs_matter[k - look.begin, i] = copies.has_job(row)
+            jobs_matter[k - first, i] = copies.has_job(row)
             if copies.has_job(row) and copies.is_cancelled(row):
                 for table in (ready, ended, started, work):
-                    table[k - look.begin, i] = NOT_DUE
+                    table[k - first, i] = NOT_DUE
         for i, (flow, source, target) in enumerate(flows):
             matters, is_cancelled = copies.message(flow, source, target)
-            messages_matter[k - look.begin, i] = matters
+            messages_matter[k - first, i] = matters
             if matters and is_cancelled:
-                arrived[k - look.begin, i] = NOT_DUE
+                arrived[k - first, i] = NOT_DUE
     assert found.start_ns is not None
     assert found.work_ns is not None
     yield "ready_ns", found.ready_ns, ready, jobs_matter

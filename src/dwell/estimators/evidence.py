@@ -84,12 +84,16 @@ class Evidence:
     shadows_share : bool
         Whether shadow jobs share the cores that own jobs leave equally with foreign threads. If
         they have lower priority, their times do not show the number of foreign threads.
+    earlier : Evidence, optional
+        The `Problem.earlier_cycles` cycles before, as known now; None if all tasks run in each
+        cycle. Runs of slow tasks that had not ended by the decision before count now.
     """
 
     close_ns: int
     release_ns: Ints
     rows: WindowRows
     shadows_share: bool = True
+    earlier: Evidence | None = None
 
     @classmethod
     def of(
@@ -102,11 +106,12 @@ class Evidence:
         shadows: Instants | None,
         *,
         shadows_share: bool = True,
+        earlier: Evidence | None = None,
     ) -> Evidence:
         """Make the evidence from the instants of cycles and of their shadows."""
         sent = None if shadows is None else shadows.columns(shadow_placement)
         rows = WindowRows.of(cycles.columns(placement), sent)
-        return cls(close_ns, release_ns, rows, shadows_share)
+        return cls(close_ns, release_ns, rows, shadows_share, earlier)
 
     def with_instants(self, cycles: Instants, shadows: Instants | None) -> Evidence:
         """Return the evidence with other instants."""

@@ -147,6 +147,8 @@ class Meter:
             if isinstance(part, Site) and nodes[part.node].interference > 1.0
         ]
         self._layouts: dict[int, CyclesLayout] = {}
+        #: Ends of the last two windows.
+        self._ends_ns = 0, 0
         sharing = [node for node in nodes.values() if _shares_evenly(node, shared)]
         #: Nodes whose jobs share the cores evenly, with the most threads of their bursts.
         self._sharing = [(one.name, one.bursts.threads if one.bursts else 0) for one in sharing]
@@ -164,7 +166,7 @@ class Meter:
 
         The next window overwrites the values.
         """
-        self._take_apart(self._times, evidence, evidence.rows)
+        self._take_apart(self._times, evidence, _rows_of)
         return self._by_part(self._times)
 
     def demands(
@@ -200,10 +202,16 @@ class Meter:
             # The declared demands include the interference of bursts.
             if foreign.get(node.name, 0.0) - node.burst_threads >= BESIDE:
                 self._cost[number] /= node.interference
+        self._take_apart(self._demands, evidence, partial(self._worked, foreign, full))
+
+    def _worked(
+        self, foreign: Mapping[str, float], full: Mapping[str, UsedCores], evidence: Evidence
+    ) -> WindowRows:
+        """Return the instants with the work of all completed jobs; the next call overwrites it."""
         rows = evidence.rows
         if any(rows.unknown(evidence.close_ns - self._patience_ns)[1:]):
             rows = self._with_work(evidence, foreign).rows
-        self._take_apart(self._demands, evidence, self._with_waits(rows, foreign, full))
+        return self._with_waits(rows, foreign, full)
 
     def _with_waits(
         self, rows: WindowRows, foreign: Mapping[str, float], full: Mapping[str, UsedCores]
@@ -265,14 +273,29 @@ class Meter:
         usual, joins = self._usual_cost.copy(), self._link.copy()
         self.set_rate(link, rate_mbps)
         self._cost[:] = self._usual_cost
-        self._take_apart(self._demands, evidence, evidence.rows)
+        self._take_apart(self._demands, evidence, _rows_of)
         self._usual_cost[:], self._link[:] = usual, joins
         found = self._by_part(self._demands)
         return {part: values for part, values in found.items() if isinstance(part, Message)}
 
-    def _take_apart(self, found: PartTimes, evidence: Evidence, rows: WindowRows) -> None:
-        limit_ns = evidence.close_ns - self._patience_ns
-        found.begin(rows, limit_ns)
+    def _take_apart(
+        self, found: PartTimes, evidence: Evidence, rows_of: Callable[[Evidence], WindowRows]
+    ) -> None:
+        close_ns, earlier = evidence.close_ns, evidence.earlier
+        if close_ns != self._ends_ns[1]:
+            self._ends_ns = self._ends_ns[1], close_ns
+        limit_ns = close_ns - self._patience_ns
+        if earlier is None:
+            found.begin(rows_of(evidence), limit_ns)
+        else:
+            counted = self._ends_ns[0], close_ns - self._ends_ns[0]
+            later = len(evidence.release_ns)
+            found.begin(rows_of(earlier), limit_ns, later=later, counted=counted)
+            self._add(found, earlier, limit_ns)
+            found.go_on(rows_of(evidence))
+        self._add(found, evidence, limit_ns)
+
+    def _add(self, found: PartTimes, evidence: Evidence, limit_ns: int) -> None:
         for active in evidence.rows.candidates(limit_ns):
             found.add(active, self._layout(active))
 
@@ -428,6 +451,10 @@ def sending_ns(problem: Problem, message: Message, rate_mbps: float | None = Non
     if rate_mbps is None:
         rate_mbps = problem.fabric.links[message.link].rate_mbps
     return float(round(8e3 * bytes_of[message.source, message.target] / rate_mbps))
+
+
+def _rows_of(evidence: Evidence) -> WindowRows:
+    return evidence.rows
 
 
 def groups(codes: NDArray[np.integer]) -> Iterator[tuple[int, Rows]]:

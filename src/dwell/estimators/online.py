@@ -348,26 +348,31 @@ class Online(CellEstimator):
     ) -> Iterator[str]:
         """Yield idle nodes that have lost at least two jobs since their last completed job."""
         limit_ns = evidence.close_ns - self._patience_ns
-        if not evidence.rows.unknown(int(limit_ns.max()))[0]:
+        stretches = [one for one in (evidence.earlier, evidence) if one is not None]
+        if not any(one.rows.unknown(int(limit_ns.max()))[0] for one in stretches):
             return
-        cycles, placements = evidence.cycles, tuple(self.problem.candidates.values())
-        lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
+        placements = tuple(self.problem.candidates.values())
         ended_ns: dict[str, int] = {}
         ready_ns: dict[str, list[int]] = {}
-        for code, rows in groups(evidence.placement):
+        by_code = [
+            (code, one.cycles.at(rows)) for one in stretches for code, rows in groups(one.placement)
+        ]
+        for code, cycles in by_code:
+            lost = (cycles.end_ns < 0) & (cycles.ready_ns >= 0) & (cycles.ready_ns < limit_ns)
             for column, site in enumerate(job_columns(self.problem, placements[code])):
                 if site is None:
                     continue
                 node = site.node
-                latest = int(cycles.end_ns[rows, column].max())
+                latest = int(cycles.end_ns[:, column].max())
                 ended_ns[node] = max(ended_ns.get(node, -1), latest)
-                mine = cycles.ready_ns[rows, column][lost[rows, column]]
+                mine = cycles.ready_ns[:, column][lost[:, column]]
                 ready_ns.setdefault(node, []).extend(mine.tolist())
         span_ns = evidence.close_ns - int(evidence.release_ns[0])
         for node, ready in ready_ns.items():
             after = [at_ns for at_ns in ready if at_ns > ended_ns[node]]
             # A node with a running job is up.
             idle_ns = evidence.close_ns - max(ended_ns[node], min(after, default=0))
+            idle_ns = min(idle_ns, span_ns)
             capacity = self.problem.fabric.nodes[node].capacity
             works = own[node] * capacity * span_ns >= 0.5 * idle_ns
             # A node that is down has no foreign load, either.

@@ -8,24 +8,15 @@ from dwell.model.number_arrays import Floats, Ints
 from dwell.model.problem import Problem
 
 NS_PER_MS = 1e6
-#: Periods after which an unfinished job or message counts as lost.
-PATIENCE = 2
 
 
 def patience_ns(problem: Problem, every: int = 1) -> int:
     """Return the age from which an unfinished job or message counts as lost at a window's end.
 
-    The age is `PATIENCE` periods, but at most one period less than the window; D - P more if D is
-    longer than P, because the window then ends later by as much.
-
-    A task that runs in each `every`-th cycle, and its messages, have `PATIENCE` times this
-    interval, but less than the age of the oldest run that each decision sees. If a decision may see
-    one run only, it is lost if it does not end within its interval, or by the next decision.
+    `every` is the rate of its task. The age is `Problem.patience_cycles` periods; D - P more if D
+    is longer than P, because the window then ends later by as much.
     """
-    pipeline, periods = problem.pipeline, min(PATIENCE, problem.window_cycles - 1)
-    if every > 1:
-        seen = problem.decide_cycles
-        periods = min(PATIENCE * every, max(seen - every, min(seen, every) - 1))
+    pipeline, periods = problem.pipeline, problem.patience_cycles(every)
     more_ns = max(pipeline.deadline_ns - pipeline.period_ns, 0)
     return round(periods * pipeline.period_ms * NS_PER_MS) + more_ns
 

@@ -922,7 +922,7 @@ class _Layout:
         return day_bits, 1 << (year_ns >> day_bits).bit_length()
 
     def _slots(self) -> int:
-        """Initial room of the ring in cycles, a power of two; a window if windows are logged."""
+        """Initial room of the ring in cycles, a power of two; for evidence if it is logged."""
         held = RING_START
         if self.logs_windows and not self.logs_all:
             for problem, real in self.cells:
@@ -932,7 +932,7 @@ class _Layout:
                 if (close_ns > real.release_ns[1:]).any():
                     released = np.searchsorted(real.release_ns[:-1], close_ns)
                     after = int((released - np.arange(1, real.cycles + 1)).max())
-                held = max(held, problem.window_cycles + after)
+                held = max(held, problem.earlier_cycles + problem.window_cycles + after)
         return 1 << (held - 1).bit_length()
 
     def _announce_first(self, changes: Rows) -> None:

@@ -33,9 +33,17 @@ void add(Found& found, i64 part, f64 ms) {
   found.ms[part * found.most + found.count[part]++] = ms;
 }
 
+// Whether the last decision has counted a job or message of an earlier cycle: it had ended, or it
+// had begun so long before that it counted as lost.
+bool is_counted(const Found& found, i64 begin_ns, i64 end_ns, i64 limit_ns) {
+  if (found.counted_ns < 0) return false;
+  return (end_ns >= 0 && end_ns <= found.counted_ns) || begin_ns < limit_ns - found.passed_ns;
+}
+
 // Adds the time between two instants, or infinity for a job or message that began before the limit
 // and has not ended; one that began later, or not at all, is unknown. Returns whether it has ended.
 bool add_span(Found& found, i64 part, i64 begin_ns, i64 end_ns, i64 limit_ns) {
+  if (is_counted(found, begin_ns, end_ns, limit_ns)) return false;
   if (begin_ns >= 0 && end_ns >= 0) {
     add(found, part, static_cast<f64>(end_ns - begin_ns) / 1e6);
     return true;
@@ -121,7 +129,10 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
       const i64 part = parts[column], flow = column - n_tasks;
       if (part < 0) continue;
       const i64 source = flow < 0 ? 0 : layout->sources[flow];
-      const i64 lost_ns = limit_ns - (found->more_ns == nullptr ? 0 : found->more_ns[part]);
+      const i64 more_ns = found->more_ns == nullptr ? 0 : found->more_ns[part];
+      const i64 lost_ns = limit_ns - more_ns;
+      // In earlier cycles only the parts of slow tasks count.
+      if (found->counted_ns >= 0 && more_ns == 0) continue;
       for (i64 i = 0; i < window->n; ++i) {
         const i64* cycle = window->rows + i * window->width;
         if (cycle[0] != active || (begin > 0 && cycle[begin] != other)) continue;
@@ -130,7 +141,7 @@ DWELL_EXPORT void dwell_meter(const Layout* layout, const Window* window, i64 ac
         if (flow < 0 && found->cost == nullptr) {
           add_span(*found, part, ready_ns[column], end_ns[column], lost_ns);
         } else if (flow < 0) {
-          const bool is_known = end_ns[column] >= 0 && work_ns[column] >= 0;
+          const bool is_known = end_ns[column] > found->counted_ns && work_ns[column] >= 0;
           const f64 cost = found->cost[part];
           if (is_known) add(*found, part, static_cast<f64>(work_ns[column]) * cost / 1e6);
         } else {

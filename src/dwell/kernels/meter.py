@@ -137,6 +137,10 @@ class WindowRows:
         return known[1]
 
 
+#: `counted` of cycles of which no window has counted anything.
+OWN = -1, 0
+
+
 class PartTimes:
     """Times, or demands, of the parts of a window's cycles, milliseconds; infinite if lost.
 
@@ -187,7 +191,9 @@ class PartTimes:
         given = self._cost, self._link, self._repeats, self._more_ns
         return PartTimes, (len(self._count), *given)
 
-    def begin(self, window: WindowRows, limit_ns: int) -> None:
+    def begin(
+        self, window: WindowRows, limit_ns: int, *, later: int = 0, counted: tuple[int, int] = OWN
+    ) -> None:
         """Begin a window; this overwrites the times of the previous window.
 
         Parameters
@@ -195,9 +201,15 @@ class PartTimes:
         limit_ns : int
             A job or message that began before this, and has not ended, counts as lost; with
             `more_ns` of its part, if it began earlier by as much.
+        later : int
+            Number of cycles that `go_on` adds.
+        counted : tuple of int
+            Of earlier cycles: the end of the last window, and the time since. Only parts with
+            `more_ns` count that had not ended by then, and did not count as lost.
         """
         self._window, self._limit_ns = window, limit_ns
-        count, flows = len(window.table), window.flows
+        self.found.counted_ns, self.found.passed_ns = counted
+        count, flows = len(window.table) + later, window.flows
         if self._ms.shape[1] < 2 * count:
             self._ms = np.empty((len(self._count), 2 * count))
             self.found.ms, self.found.most = self._ms.ctypes.data, self._ms.shape[1]
@@ -209,6 +221,11 @@ class PartTimes:
                 self.found.crossings = self._crossings.ctypes.data
         self._count[:] = 0
         self.found.n_parts = 0
+
+    def go_on(self, window: WindowRows) -> None:
+        """Continue with the window's own cycles after the earlier cycles."""
+        self._window = window
+        self.found.counted_ns, self.found.passed_ns = OWN
 
     def add(self, active: int, layout: CyclesLayout) -> None:
         """Add the times of the cycles under one candidate, then the times of their shadows."""

@@ -309,6 +309,8 @@ struct Crossing;  // of meter.cpp
   field(f64*, ms) field(i64*, count) field(i64*, order) field(i64, most) field(i64, n_parts)     \
   field(const f64*, cost) field(const i64*, link) field(const i64*, repeats)                     \
   field(const i64*, more_ns) /* patience beyond the limit, null for none */                      \
+  field(i64, counted_ns) /* of earlier cycles: close of the last decision; else -1 */            \
+  field(i64, passed_ns)  /* time since then */                                                   \
   field(Crossing*, crossings) field(i64, n_crossings)
 
 // The values of a part from a single window: their number, and the sums of their places.

@@ -303,6 +303,24 @@ class Problem(Displayed):
         interval = self.pipeline.sink_cycles
         return max(-(-(self.window_cycles // 4) // interval), 1) * interval
 
+    def patience_cycles(self, every: int) -> int:
+        """Return the cycles for which a run of a task with this rate may be unfinished.
+
+        They are two of its intervals, but at most one cycle less than the window. Then the run
+        counts as lost (see `dwell.estimators.spans`).
+        """
+        return min(2 * every, self.window_cycles - 1)
+
+    @property
+    def earlier_cycles(self) -> int:
+        """Cycles before a decision's own whose slow runs may count in its evidence; 0 for none."""
+        pipeline, slowest = self.pipeline, max(self.pipeline.rates.values())
+        if slowest == 1:
+            return 0
+        return self.patience_cycles(slowest) + 2 * math.ceil(
+            pipeline.deadline_ms / pipeline.period_ms
+        )
+
     @property
     def decisions_per_window(self) -> float:
         """W over the cycles between two decisions: 1 or more."""

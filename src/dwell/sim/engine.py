@@ -562,10 +562,16 @@ def _evidence(
 ) -> Callable[[int, int, int], Evidence]:
     """Return the function that extracts a window's evidence from the logs."""
     logged = LoggedCycles(arrays, flow_columns(problem))
+    count = problem.earlier_cycles
 
     def cut(first: int, last: int, close_ns: int) -> Evidence:
-        rows = logged.window(first, last)
-        return Evidence(close_ns, realisation.release_ns[first:last].copy(), rows)
+        begin = max(first - count, 0)
+        earlier = cut_rows(begin, first, close_ns) if begin < first else None
+        return cut_rows(first, last, close_ns, earlier)
+
+    def cut_rows(first: int, last: int, close_ns: int, earlier: Evidence | None = None) -> Evidence:
+        rows, release_ns = logged.window(first, last), realisation.release_ns[first:last].copy()
+        return Evidence(close_ns, release_ns, rows, earlier=earlier)
 
     return cut
 

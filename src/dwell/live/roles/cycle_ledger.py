@@ -649,11 +649,18 @@ class Ledger:
     # ----------------------------------------------------------------------- evidence
 
     def evidence(
-        self, cycles: Sequence[LiveCycle], release_ns: Ints, close_ns: int, *, shadows: bool
+        self,
+        cycles: Sequence[LiveCycle],
+        release_ns: Ints,
+        close_ns: int,
+        *,
+        shadows: bool,
+        earlier: Sequence[LiveCycle] = (),
     ) -> Evidence:
         """Return the instants of a window's jobs and messages that are known at its end.
 
-        `shadows` tells whether the result has the shadows' instants.
+        `shadows` tells whether the result has the shadows' instants. `earlier` are the cycles of
+        `Evidence.earlier`.
         """
         known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
         for tables in (known, of_shadows):
@@ -690,6 +697,10 @@ class Ledger:
         for row, cycle in enumerate(cycles):
             if cycle.at_ns + cycle.latency_ns <= close_ns:
                 self._mark_cancelled(known, row, cycle)
+        before = None
+        if earlier:
+            before_ns = np.array([cycle.at_ns for cycle in earlier], np.int64)
+            before = self.evidence(earlier, before_ns, close_ns, shadows=shadows)
         return Evidence.of(
             close_ns=close_ns,
             release_ns=release_ns,
@@ -699,6 +710,7 @@ class Ledger:
             shadows=Instants(**of_shadows) if shadows else None,
             # Agents run shadow jobs in the lowest scheduling class of the system.
             shadows_share=False,
+            earlier=before,
         )
 
     def _unknown(self, cycles: int) -> dict[str, Ints]:

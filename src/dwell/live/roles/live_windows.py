@@ -475,7 +475,8 @@ class LiveWindows:
         window = self._next_window if cycles[-1].window is None else cycles[-1].window
         row = self.record.next_row + end - 1 - self._window.at
         release_ns = np.array([cycle.at_ns for cycle in cycles], np.int64)
-        shadows = sends_shadows(self._controller)
+        shadows, earlier = sends_shadows(self._controller), self._earlier(cycles[0])
+        of_cycles = partial(self._ledger.evidence, cycles, release_ns, close_ns)
         known, ages = told(cycles), self.record.ages
         ages.judge(cycles, close_ns, ages.known)
         ages_ns, age_ms = ages.seen(self._recent(cycles), cycles, close_ns)
@@ -486,11 +487,22 @@ class LiveWindows:
             open_ns=int(release_ns[0]),
             core_ns=self._ledger.core_ns(cycles, close_ns),
             looked=LookedAt(window, row, end - begin),
-            evidence=partial(self._ledger.evidence, cycles, release_ns, close_ns, shadows=shadows),
+            evidence=partial(of_cycles, shadows=shadows, earlier=earlier),
             over_age=np.array([cycle.over_age for cycle in known], np.bool_),
             ages_ns=ages_ns,
             age_ms=age_ms,
         )
+
+    def _earlier(self, first: LiveCycle) -> list[LiveCycle]:
+        """Return the known cycles before a stretch that its evidence has (see `Evidence`)."""
+        count = self.problem.earlier_cycles
+        numbers = range(first.number - count, first.number + 1) if count else ()
+        known = [self._by_key.get((first.run, number)) for number in numbers]
+        cycles = [cycle for cycle in known if cycle is not None]
+        for cycle, following in pairwise(cycles):
+            if cycle.row < 0:
+                cycle.deaf = not cycle.heard or not following.heard
+        return cycles[:-1]
 
     def _recent(self, cycles: list[LiveCycle]) -> list[LiveCycle]:
         """Return the cycles whose commands may count in the ages of some cycles, by number."""
