@@ -179,6 +179,31 @@ def test_the_first_job_after_a_return_gets_no_value_from_before_the_move() -> No
     require_never_older(log.samples)
 
 
+class _StatefulController(_Controller):
+    def snapshot(self) -> bytes:
+        return b"-"
+
+    def restore(self, state: bytes) -> None:
+        pass
+
+
+def test_jobs_that_follow_a_state_get_no_value_from_before_the_move() -> None:
+    on: dict[str, Any] = {"R": {"exec_ms": 1}}
+    tasks: dict[str, Any] = {name: {"on": on} for name in ("imu", "detect", "act")}
+    tasks["camera"] = {"every": SLOW, "on": on}
+    tasks["control"] = {"state_bytes": 100, "on": {**on, "E": {"exec_ms": 1}}}
+    candidates = {"LOC": {"control": "R"}, "AWAY": {"control": "E"}}
+    problem, log = sampling(tasks=tasks, candidates=candidates), Log()
+    stages = {"control": lambda name: _StatefulController(name, log)}
+    world = world_of(problem, stages=stages, policy=Staying())
+    for placement in ("AWAY", "LOC", "AWAY", "LOC"):
+        world.run(500)
+        world.pin(placement)
+    world.run(500)
+    assert world.stamper.placement == "LOC"
+    require_never_older(log.samples)
+
+
 def test_a_task_with_sampled_inputs_alone_runs_no_more_where_it_was() -> None:
     away = {"on": "E", "initial": "AWAY"}
     world, log = logged(sampling(waited=False, controller=away))

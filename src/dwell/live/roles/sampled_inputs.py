@@ -17,9 +17,9 @@ class SampledInputs:
     """Values of a worker: the newest message of each sampled flow that has arrived here.
 
     When the task moves, its old node forwards its values to the new one over the direct link, and
-    then each newer message that still arrives. A worker whose task comes back drops the values that
-    it has passed on: the other node may have used newer ones. A shadow worker has no values, and a
-    standby (`forwards` is false) keeps its own.
+    then each newer message that still arrives. When the task comes back, or the inputs of jobs are
+    forked to here, jobs use no value from before: the other node may have used newer ones. A shadow
+    worker has no values, and a standby (`forwards` is false) keeps its own.
     """
 
     def __init__(self, place: RolePlace, task: str, *, forwards: bool) -> None:
@@ -36,11 +36,12 @@ class SampledInputs:
         }
         self._forwards = forwards
         self._values: Inputs = {}
-        # Node of the task under the newest stamp, and this stamp's run, cycle and term.
-        self._at, self._newest = place.node, (-1, -1, -1)
-        # Highest cycles passed on, by flow and, if they were sent, by node.
+        # Node of the task under the newest stamp, this stamp, and the first stamp with which the
+        # task last left this node, as run, cycle and term.
+        self._at = place.node
+        self._newest = self._left_at = (-1, -1, -1)
+        # Highest cycles that other nodes may have passed by now, by flow.
         self._left: dict[str, tuple[int, int]] = {}
-        self._sent: dict[tuple[str, str], tuple[int, int]] = {}
 
     @property
     def is_away(self) -> bool:
@@ -75,15 +76,22 @@ class SampledInputs:
         self._values[source] = header, payload, at_ns
         # Guesses of a source and forked inputs also reach nodes on which the task does not run.
         copied = not stamp.term or (self._task, self._place.node) in stamp.forks
-        if not copied:
-            self._forward(source)
+        if self.is_away and not copied:
+            self._leave(source, forwards=self._forwards)
         return True
 
     def newest(self, stamp: Stamp) -> Inputs:
-        """Return the values for a job with a stamp that begins now."""
+        """Return the values for a job with a stamp that begins now.
+
+        After the task has left, only jobs of cycles from before use values from before.
+        """
         if stamp.term:  # not a source's guess
             self.stamped(stamp)
-        return dict(self._values)
+        if (*stamp.key, stamp.term) < self._left_at:
+            return dict(self._values)
+        left, none = self._left, (-1, -1)
+        values = self._values.items()
+        return {name: one for name, one in values if one[0].stamp.key > left.get(name, none)}
 
     def stamped(self, stamp: Stamp) -> None:
         """Follow the task to its node under a stamp, unless a newer one is known."""
@@ -93,29 +101,23 @@ class SampledInputs:
         )
         if placed is None or order <= self._newest:
             return
-        self._newest = order
-        if placed.first[self._task] == self._at:
-            return
+        was_here, self._newest = not self.is_away, order
         self._at = placed.first[self._task]
-        if self._at == self._place.node:
-            for source, last in self._left.items():
-                if source in self._values and self._values[source][0].stamp.key <= last:
-                    del self._values[source]
-            self._left.clear()
+        if not self.is_away or (self._task, self._place.node) in stamp.forks:
+            return
+        if was_here:
+            self._left_at = order
         for source in self._values:
-            self._forward(source)
+            self._leave(source, forwards=self._forwards and was_here)
 
-    def _forward(self, source: str) -> None:
-        """Send a value to the task's node, unless it is here, or this or a newer one was sent."""
-        node, (header, payload, _) = self._at, self._values[source]
-        if node == self._place.node:
-            return
+    def _leave(self, source: str, *, forwards: bool) -> None:
+        """Keep a value from later jobs here; send it to the task's node, unless it was left."""
+        header, payload, _ = self._values[source]
         cycle = header.stamp.key
-        self._left[source] = max(self._left.get(source, cycle), cycle)
-        known = self._sent.get((source, node))
-        if not self._forwards or node not in self._linked or (known is not None and known >= cycle):
+        if self._left.get(source, (-1, -1)) >= cycle:
             return
-        self._sent[source, node] = cycle
-        key = self._place.keys.of(channels.VALUE, self._task, node, self._place.node)
-        lane = lane_of(self._bytes[source])
-        self._place.transport.put(key, payload, encode(header), lane=lane)
+        self._left[source] = cycle
+        if forwards and self._at in self._linked:
+            key = self._place.keys.of(channels.VALUE, self._task, self._at, self._place.node)
+            lane = lane_of(self._bytes[source])
+            self._place.transport.put(key, payload, encode(header), lane=lane)
