@@ -76,3 +76,15 @@ def test_the_age_of_a_sampled_picture_takes_the_place_of_the_latency() -> None:
     status = world.status["window"]
     assert status["mean_age_ms"] > 0
     assert status["predicted"]["LOC"]["age_ms"] > 0
+
+
+def test_the_headline_names_the_chain_whose_data_are_too_old() -> None:
+    chains = {
+        "see-act": {"from": "camera", "to": "act", "max_age_ms": 40},
+        "feel": {"from": "imu", "to": "act"},
+    }
+    world = world_of(sampling(chains=chains), policy=Staying())
+    world.run(1_500)
+    assert world.status["health"] == "degraded"
+    assert "see-act's max_age_ms (40)" in world.status["headline"]
+    assert "feel" not in world.status["headline"]

@@ -183,7 +183,7 @@ def _symptoms(
     placed = problem.candidates[status["placement"]].sites
     names = [*(f"{task}@{node}" for task, node in placed), *(role.who for role in sinks)]
     unreached = [] if slow else _unreached(problem, status, recent["unreached"])
-    why = [*slow, *unreached, *_notes(status, names)]
+    why = [*slow, *unreached, *_old_data(problem, recent["over_age"]), *_notes(status, names)]
     yield from _uneven(problem, status, why)
     if problem.live.degraded_by(rates):
         rate = RATE.text(sum(rates) / len(rates))
@@ -207,6 +207,17 @@ def _slow(problem: Problem, status: Mapping[str, Any]) -> Iterator[str]:
         interval_ms = problem.pipeline.rates[task] * problem.pipeline.period_ms
         takes = f"{one['stage']} takes {one['exec_ms']:.0f} ms of {interval_ms:.0f}"
         yield f"{takes}{lost if one['replaced'] else ''}"
+
+
+def _old_data(problem: Problem, cycles: int) -> Iterator[str]:
+    """Yield the chains whose data were too old in some cycles."""
+    bounded = [
+        f"{name}'s max_age_ms ({chain.max_age_ms:g})"
+        for name, chain in problem.pipeline.chains.items()
+        if chain.is_bounded
+    ]
+    if cycles:
+        yield f"{counted(cycles, 'command')} had data older than {' or '.join(bounded)}"
 
 
 def _stale(limit_ms: float, age_ms: float | None) -> str:

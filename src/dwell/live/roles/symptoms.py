@@ -91,7 +91,8 @@ class Symptoms:
         ``begun_ms``: time since the first message about a cycle, or None. ``silences``: number of
         calls of ``hold`` or ``zero`` before an applied command. ``release_ratio``: released cycles
         per period, over at most three windows; None before the first. ``recent``: V_D and
-        `_commands` of the last windows, and the message that most of their lost cycles lack.
+        `_commands` of the last windows, the number of their cycles whose data are over a chain's
+        ``max_age_ms``, and the message that most of their lost cycles lack.
         ``sinks``: age of the last applied command, or None; outcome of the last command; if that is
         stale, the time between arrivals of its stamp and its completion here. ``failing``: by
         candidate whose last shadows have all failed, the number of these shadows
@@ -108,6 +109,7 @@ class Symptoms:
                     window.violation_rate(self._deadline_ns) for window in self._recent
                 ],
                 **self._commands(),
+                "over_age": sum(one.over_age for window in self._recent for one in window.cycles),
                 "unreached": self._mostly_unreached(),
             },
             "sinks": {
