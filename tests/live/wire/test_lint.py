@@ -2,10 +2,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import pytest
+
 import dwell
 from dwell.cellfile import from_document
 from dwell.live.wire.lint import lint
 from tests.cells.light import document
+from tests.live.small_world import World, canonical
 
 
 def test_a_grace_shorter_than_the_guard_is_warned_of() -> None:
@@ -36,3 +39,21 @@ def test_a_state_that_lags_behind_is_warned_of() -> None:
 
 def test_a_cell_for_the_simulator_is_not_warned_of() -> None:
     assert not list(lint(dwell.load("examples/canonical.yaml")))
+
+
+@pytest.mark.parametrize("cycles", [2, 3])
+def test_a_guard_that_hears_links_too_seldom_is_warned_of(cycles: int) -> None:
+    problem = canonical(20, guard_cycles=cycles)
+    world = World(problem)
+    world.run(1_000)
+    heard = 0
+    for _ in range(100):
+        world.run(1.7)
+        heard += world.stamper.guard.presence.whole("SO", world.network.now_ns)
+    assert heard >= 95 or cycles == 2
+    assert heard <= 30 or cycles > 2
+    live = from_document({**document(), "controller": {"guard_cycles": cycles}})
+    found = [str(fault) for fault in lint(live) if "guard_cycles" in str(fault)]
+    assert [one.partition(": 2 is for")[0] for one in found] == (
+        ["controller.guard_cycles"] * (cycles == 2)
+    )

@@ -8,6 +8,9 @@ from dwell.errors import Fault
 from dwell.live.wire.wiring import lagging_states
 from dwell.model import Problem
 
+#: Least `guard_cycles` for which beats, one per period, show that a link is up.
+HEARD_CYCLES = 3
+
 
 def lint(problem: Problem) -> Iterator[Fault]:
     """Yield settings that a live cell does not follow or refuses, or that reduce its performance.
@@ -17,6 +20,7 @@ def lint(problem: Problem) -> Iterator[Fault]:
     if problem.live.hosts or any(task.run for task in problem.pipeline.tasks.values()):
         yield from _side_by_side(problem)
         yield from _early_closes(problem)
+        yield from _short_guard(problem)
         yield from lagging_states(problem)
 
 
@@ -43,4 +47,16 @@ def _early_closes(problem: Problem) -> Iterator[Fault]:
             "a window that closes before the guard acts may bring an order to a placement that the "
             "fault has broken, too, and the guard waits for that one again: up to "
             f"{2 * lost - 1} cycles are lost instead of {lost}",
+        )
+
+
+def _short_guard(problem: Problem) -> Iterator[Fault]:
+    """Yield a `guard_cycles` for which links are hardly ever heard, so that no move uses them."""
+    settings = problem.controller
+    if settings.guard_cycles < HEARD_CYCLES and problem.fabric.links:
+        yield Fault(
+            "controller.guard_cycles",
+            f"{settings.guard_cycles} is for the simulator: a live cell knows of a link once per "
+            "period, too late for this guard, so orders and the guard's moves over links wait; "
+            f"set at least {HEARD_CYCLES}",
         )
