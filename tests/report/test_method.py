@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.model import (
     Constant,
     Disturbance,
@@ -23,6 +24,7 @@ from dwell.model import (
     Trace,
     TraceTable,
     Uniform,
+    evolve,
 )
 from dwell.report.method import (
     cell_definitions,
@@ -30,6 +32,7 @@ from dwell.report.method import (
     placements_table,
     scenarios_table,
 )
+from tests.cells.rated import inner_loop
 from tests.cells.small import make_problem
 
 EPISODES = Episodes("edge", every_s=Exponential(30.0), for_s=Uniform(2.0, 10.0))
@@ -92,6 +95,29 @@ def test_placements_with_replicas_have_both_nodes_and_their_members() -> None:
     assert rows["ONE"] == {"placement": "ONE", "policy": "A"}
     assert rows["NOW"] == {"placement": "NOW", "policy": "A + B", "copies": "ONE; TWO at once"}
     assert rows["LATER"]["copies"] == "ONE; TWO after 9.5 ms"
+
+
+def test_rates_chains_and_all_terms_of_the_cost_are_told() -> None:
+    chain = {"from": "camera", "to": "control", "max_age_ms": 150}
+    problem = evolve(
+        from_document(inner_loop(chains={"see-act": chain})),
+        {
+            "objective.latency": "see-act",
+            "objective.weights": {"age": 2, "price": 3},
+            "objective.targets": {"age_ms": 80, "price_per_hour": 0.5},
+            "objective.caps": {"misses": {"m": 1, "k": 20}},
+            "links[0].price_per_gb": 0.1,
+        },
+    )
+    told = cell_definitions(problem)
+    assert told["every n cycles"] == "camera 10; detect 10"
+    assert told["sampled"] == "detect → control"
+    assert told["chains"] == "see-act: camera to control, at most 150 ms"
+    for term in ("L95 of the age of see-act / 7 ms", "2 · age / 80 ms"):
+        assert term in told["cost"]
+    assert "3 · price of bytes / 0.5 /h" in told["cost"]
+    assert told["caps"] == "at most 1 miss in 20 cycles"
+    assert "chains" not in cell_definitions(make_problem())
 
 
 def test_each_policy_and_estimator_is_told_once() -> None:

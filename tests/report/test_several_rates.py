@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import dwell
@@ -13,7 +14,9 @@ from dwell.report.charts import latency_limit
 from dwell.report.phases import phase_rows
 from dwell.report.run_header import RunHeader
 from dwell.report.run_page import run_page
-from tests.report.pages import figure_of
+from dwell.report.study_page import study_page
+from dwell.study import Contender, Point, Study, open_study, run_study
+from tests.report.pages import figure_of, table_of
 
 
 def sparse(**changes: object) -> Problem:
@@ -73,3 +76,20 @@ def test_a_page_without_an_age_limit_has_no_line() -> None:
     caption = figure_of(page, "time").caption
     assert "of the data ages of see-act" in caption
     assert "limit" not in caption
+
+
+def test_a_study_with_parameters_shows_ages(tmp_path: Path) -> None:
+    values = ({"deadline_ms": ms} for ms in (4, 5))
+    study = Study(
+        name="ages",
+        points=tuple(Point(one, sparse(**one)) for one in values),
+        scenarios=("baseline",),
+        contenders=(Contender("R", "R"),),
+        seeds=(1,),
+        windows=4,
+    )
+    run_study(study, folder=tmp_path / "ages", processes=1)
+    page = study_page(open_study(tmp_path / "ages"))
+    rows = table_of(page, "pivot-age_l95_see-act-0").rows
+    # Old data are 23 and 44 ms old; in the first window an actuation without data comes after 4.
+    assert [(row["4"], row["5"]) for row in rows] == [((23 + 3 * 44) / 4,) * 2]

@@ -12,6 +12,7 @@ from dwell.model import (
     LinkDisturbance,
     Node,
     NodeDisturbance,
+    Pipeline,
     Placement,
     Problem,
     Process,
@@ -64,6 +65,7 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
     return {
         "cell": problem.name,
         "pipeline": str(pipeline),
+        **_rates(pipeline),
         "period": write_ms(pipeline.period_ms),
         "deadline": write_ms(pipeline.deadline_ms),
         "nodes": ", ".join(
@@ -82,6 +84,23 @@ def cell_definitions(problem: Problem) -> dict[str, str]:
         "Δ_min": f"{controller.min_improvement:g}",
         "estimator": estimator,
     }
+
+
+def _rates(pipeline: Pipeline) -> dict[str, str]:
+    """Return the rates of tasks, the sampled flows and the chains, if there are any."""
+    bounds = {
+        name: f", at most {write_ms(chain.max_age_ms)}" if chain.is_bounded else ""
+        for name, chain in pipeline.chains.items()
+    }
+    parts = {
+        "every n cycles": [f"{name} {rate}" for name, rate in pipeline.rates.items() if rate > 1],
+        "sampled": [f"{flow.source} → {flow.target}" for flow in pipeline.flows if flow.sampled],
+        "chains": [
+            f"{name}: {chain.source} to {chain.target}{bounds[name]}"
+            for name, chain in pipeline.chains.items()
+        ],
+    }
+    return {name: "; ".join(those) for name, those in parts.items() if those}
 
 
 def placements_table(problem: Problem, prefix: str = "") -> Table:
@@ -174,17 +193,23 @@ def _accelerators(node: Node) -> str:
 
 def _cost(problem: Problem) -> str:
     """Return the formula of J with the weights and targets of a cell."""
-    weights, targets = problem.objective.weights, problem.objective.targets
+    objective = problem.objective
+    weights, targets, chain = objective.weights, objective.targets, objective.latency
+    l95 = "L95" if chain is None else f"L95 of the age of {chain}"
     terms = [
-        f"{weights.latency:g} · L95 / {targets.latency_ms:.4g} ms",
+        f"{weights.latency:g} · {l95} / {targets.latency_ms:.4g} ms",
         f"{weights.violations:g} · V_D",
         f"{weights.robot:g} · U_r / {targets.robot:g}",
         f"{weights.edge:g} · U_e / {targets.edge:g}",
     ]
     if weights.cloud is not None and targets.cloud is not None:
         terms.append(f"{weights.cloud:g} · U of the cloud / {targets.cloud:g}")
+    if weights.age and targets.age_ms is not None:
+        terms.append(f"{weights.age:g} · age / {targets.age_ms:.4g} ms")
+    if weights.price and targets.price_per_hour is not None:
+        terms.append(f"{weights.price:g} · price of bytes / {targets.price_per_hour:g} /h")
     terms.append(f"{weights.switching:g} · share of the tasks moved")
-    of = "; U of accelerators, too" if problem.objective.accelerators else ""
+    of = "; U of accelerators, too" if objective.accelerators else ""
     return f"J = {' + '.join(terms)}{of}"
 
 
@@ -195,6 +220,8 @@ def _caps(problem: Problem) -> str:
         found.append(f"L95 {caps.latency_ms:g} ms")
     if math.isfinite(caps.utilisation):
         found.append(f"U {percent(caps.utilisation)}")
+    if caps.misses is not None:
+        found.append(f"at most {counted(caps.misses.m, 'miss')} in {caps.misses.k} cycles")
     return ", ".join(found) or "–"
 
 

@@ -17,7 +17,7 @@ from dwell.report.page import Block, Definitions, Page, Section, page_html
 from dwell.report.policy_blocks import MOST_COLUMNS, THE_AIM, PolicyBlocks, named, scaled
 from dwell.report.table import WITHOUT_WARMUP, Table, Text
 from dwell.study import StudyRuns, over_seeds
-from dwell.study.metric import Metric, metric_of
+from dwell.study.metric import Metric, further_columns, metric_of
 
 if TYPE_CHECKING:
     import polars as pl
@@ -74,7 +74,7 @@ def _sections(study: StudyRuns, blocks: PolicyBlocks) -> Iterator[Section]:
 
 
 def _metrics(study: StudyRuns) -> list[Metric]:
-    columns = (*SHOWN, *study.metrics)
+    columns = (*SHOWN, *further_columns(study.problem.pipeline.chains), *study.metrics)
     return [metric_of(name) for name in columns if name in study.runs.columns]
 
 
