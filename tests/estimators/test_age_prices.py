@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 import dwell
+from dwell.cellfile import from_document
 from dwell.cost import excess
 from dwell.estimators.candidate_player import CandidatePlayer
 from dwell.estimators.fleet_prices import FleetPrices, PricedCell
@@ -163,3 +164,22 @@ def test_stretches_count_data_that_are_too_old() -> None:
         assert of_fleet is not None
         shares.append((prices_of(cell)["EDGE"].misses, of_fleet.misses))
     assert shares == [(0.0, 0.0), (1.0, 1.0)]
+
+
+@pytest.mark.parametrize("deadline_ms", [20, 100, 1280])
+def test_a_price_has_no_age_of_windows_that_close_after_the_last_release(deadline_ms: int) -> None:
+    """A constant latency of 86 ms and half of 20 ms, with few cycles."""
+    document = {
+        "dwell": 1,
+        "period_ms": 20,
+        "deadline_ms": deadline_ms,
+        "nodes": {"R": {"tier": "robot", "cores": 5}},
+        "tasks": {"see": {"workers": 5, "on": {"R": {"exec_ms": 86}}}},
+        "candidates": {"R": {}},
+        "objective": {"weights": {"age": 1}, "targets": {"age_ms": 100}},
+    }
+    price = prices_of(from_document(document))["R"]
+    assert price.age is not None
+    assert price.age == pytest.approx((min(96, 4 * max(deadline_ms, 20)), 0.0))
+    assert price.own["R"] == pytest.approx(86 / 20 / 5)
+    assert price.cycles < 2_000

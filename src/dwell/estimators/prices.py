@@ -311,7 +311,8 @@ def price_of(player: CandidatePlayer, name: str, *, is_last: bool = True) -> Pri
     cap = problem.objective.caps.misses
     finished_ms = latency_ns[done] / 1e6
     uncut_l95_ms, lost_windows = _uncut(problem, realisation, windows, latency_ns, outcome)
-    own, foreign = windows.shares[:, 1], _foreign(windows.shares)
+    shares = windows.shares[: _closed(problem, realisation, windows)]
+    own, foreign = shares[:, 1], _foreign(shares)
     stretches = foreign
     if len(looks := tables.look_shares[0, since // problem.decide_cycles :, 0]):
         stretches = _foreign(looks)
@@ -375,15 +376,27 @@ def _missed(player: CandidatePlayer, arrays: Arrays, since: int) -> NDArray[np.b
     return due_misses(*played, slice(since, realisation.cycles))
 
 
+def _closed(problem: Problem, realisation: Realisation, windows: PlayedWindows) -> int:
+    """Return how many of the windows have their last deadline by the last release, at least one.
+
+    After it nothing is released: load falls, and ages grow.
+    """
+    pipeline, release_ns = problem.pipeline, realisation.release_ns
+    later_ns = pipeline.deadline_ns - pipeline.period_ns
+    beyond = release_ns[problem.window_cycles :: problem.window_cycles] + later_ns > release_ns[-1]
+    return max(len(windows.age_ms) - int(beyond.sum()), 1)
+
+
 def _age(
     player: CandidatePlayer, name: str, windows: PlayedWindows, *, is_last: bool
 ) -> tuple[float, float]:
     """Return the mean age of some windows of a candidate, and its standard error."""
     ((problem, realisation),) = player.cells
-    age_ms, error_ms = mean_and_error(windows.age_ms)
+    closed = _closed(problem, realisation, windows)
+    series = windows.age_ms[:closed], windows.violation_rate[:closed]
+    age_ms, error_ms = mean_and_error(series[0])
     if is_last:
         slow = slow_processes(problem, realisation.scenario)
-        series = windows.age_ms, windows.violation_rate
         error_ms, _ = slow.errors(problem, realisation, name, *series, (error_ms, 0.0))
     return age_ms, error_ms
 
