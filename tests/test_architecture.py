@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
 from graphlib import TopologicalSorter
 from importlib import import_module
 from importlib.util import find_spec
@@ -102,17 +103,22 @@ BY_NAME = {
     *("calibration/target", "live/stage", "model/user_classes"),
     *("cli/doctor", "study/cluster"),
 }
-TREES = {
-    str(path.relative_to(SOURCES).with_suffix("")): ast.parse(path.read_text(encoding="utf-8"))
-    for path in SOURCES.rglob("*.py")
-}
+
+
+@cache
+def trees() -> dict[str, ast.Module]:
+    """Return the syntax tree of each source, by name."""
+    return {
+        str(path.relative_to(SOURCES).with_suffix("")): ast.parse(path.read_text(encoding="utf-8"))
+        for path in SOURCES.rglob("*.py")
+    }
 
 
 def test_only_facades_and_entry_points_import_by_name() -> None:
     calls = {"import_module", "__import__", "attach_stub"}
     found = {
         name
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         for node in ast.walk(tree)
         if isinstance(node, ast.Call)
         and calls & {getattr(node.func, "id", ""), getattr(node.func, "attr", "")}
@@ -136,7 +142,7 @@ def test_a_string_names_modules_of_its_own_package_alone() -> None:
             if (match := re.fullmatch(r"dwell\.(\w*)(?:\.[\w.]*)?(?::\w*)?", text))
             and (match[1] in {"", *PACKAGES, *MODULES})
         }
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         if name != "__init__"
     }
     abroad = {name: some - {name.partition("/")[0]} for name, some in named.items()}
@@ -147,7 +153,7 @@ def test_only_the_command_imports_the_facade() -> None:
     """The façade may import all, so that what it is imported by would be above all."""
     found = {
         name.rpartition("/")[0]
-        for name, tree in TREES.items()
+        for name, tree in trees().items()
         for node in ast.walk(tree)
         if (isinstance(node, ast.Import) and any(one.name == "dwell" for one in node.names))
         or (isinstance(node, ast.ImportFrom) and node.module == "dwell")

@@ -137,7 +137,9 @@ def test_an_interrupted_study_goes_on(tmp_path: Path, policy: str) -> None:
 def test_synchronous_cameras_cost_a_third(quiet: Fleet) -> None:
     """Of canonical cells on SO, without other tenants."""
     found = {
-        phases: capacity_of(quiet, policy="SO", phases=phases, most=12, seeds=(1, 2, 3, 4))
+        phases: capacity_of(
+            quiet, policy="SO", phases=phases, most=12, seeds=(1, 2, 3, 4), processes=1
+        )
         for phases in ("sync", "random", "even")
     }
     assert found["sync"].robots == 6
@@ -319,7 +321,8 @@ def test_twins_take_cells_in_turn() -> None:
 def test_where_phases_are_drawn_the_draw_is_the_unit() -> None:
     """Constant jobs of 1 ms, P = 10, D = 4: of 40,000 draws 1.75 % are missed at 7, 5.6 % at 8."""
     cell = within(one_job(1.0), 4.0)
-    found = capacity_of(fleet_of((cell, 1)).changed(policy="OFF", phases="random"), most=11)
+    fleet = fleet_of((cell, 1)).changed(policy="OFF", phases="random")
+    found = capacity_of(fleet, most=11, processes=1)
     low, high = found.interval
     assert low <= 7 <= high
     assert high - low <= 3
@@ -339,7 +342,13 @@ def test_ten_draws_without_a_miss_are_no_certainty() -> None:
 
 def test_a_policy_is_searched_by_bisection(quiet: Fleet) -> None:
     found = capacity_of(
-        quiet, policy="latency-first", phases="even", most=12, seeds=(1, 2), cycles=200
+        quiet,
+        policy="latency-first",
+        phases="even",
+        most=12,
+        seeds=(1, 2),
+        cycles=200,
+        processes=1,
     )
     assert found.searched == "bisection"
     sizes = [point.robots for point in found.curve]
