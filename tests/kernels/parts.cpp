@@ -57,6 +57,7 @@ DWELL_EXPORT void part_waiting(const Waiting* jobs, i64 n, Waiting* heap, Waitin
 
 DWELL_EXPORT i64 part_later(i64 t, i64 duration) noexcept { return later(t, duration); }
 DWELL_EXPORT i64 part_whole_ns(f64 duration) noexcept { return whole_ns(duration); }
+DWELL_EXPORT i64 part_ceil_ns(f64 duration) noexcept { return ceil_ns(duration); }
 DWELL_EXPORT i64 part_last_ns() noexcept { return kLastNs; }
 DWELL_EXPORT f64 part_attempt_uniform(u64 key, i64 cycle, i64 attempt) noexcept {
   return attempt_uniform(key, cycle, attempt);

@@ -29,7 +29,7 @@ def parts() -> ctypes.CDLL:
         # A library that is open needs its file no more.
         loaded = ctypes.CDLL(str(compile_one(name, SOURCE, Path(folder, "parts.so"))))
     loaded.part_attempt_uniform.restype = ctypes.c_double
-    for name in ("events", "running", "later", "whole_ns", "last_ns", "key"):
+    for name in ("events", "running", "later", "whole_ns", "ceil_ns", "last_ns", "key"):
         getattr(loaded, f"part_{name}").restype = ctypes.c_int64
     return loaded
 

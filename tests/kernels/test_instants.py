@@ -36,3 +36,15 @@ def test_sums_end_at_the_last_instant(t: int, duration: int, sum_ns: int) -> Non
 )
 def test_durations_end_there_too(duration: float, whole_ns: int) -> None:
     assert parts().part_whole_ns(ctypes.c_double(duration)) == whole_ns
+
+
+@pytest.mark.parametrize(
+    "duration", [-1.5, -1.0, -0.5, -0.0, 0.0, 1e-300, 0.5, 1.0, 1.5, 2.0**52 - 0.5, 2.0**53, 1e18]
+)
+def test_a_part_of_a_nanosecond_counts_as_a_whole_one(duration: float) -> None:
+    assert parts().part_ceil_ns(ctypes.c_double(duration)) == math.ceil(duration)
+
+
+@pytest.mark.parametrize("duration", [float(LAST_NS), 1e19, math.inf])
+def test_rounded_durations_end_there_too(duration: float) -> None:
+    assert parts().part_ceil_ns(ctypes.c_double(duration)) == LAST_NS

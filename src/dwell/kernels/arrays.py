@@ -551,11 +551,15 @@ class _Layout:
             for chain in pipeline.chains.values()
         ]
         rates, needed_by = pipeline.rates, pipeline.sink_rates
+        in_0 = copy * len(flows)
         for name, task in pipeline.tasks.items():
             outputs = [flow_row[flow.source, flow.target] for flow in pipeline.outputs(name)]
+            n_inputs = sum(flow.target == name for flow in flows)
             self.rows["tasks"].append(
                 {
                     "n_in": len(pipeline.waited(name)),
+                    "in_0": in_0,
+                    "n_inputs": n_inputs,
                     "n_out": len(outputs),
                     "out_0": len(self.outputs),
                     "offset_ns": round(task.offset_ms * 1e6),
@@ -564,6 +568,7 @@ class _Layout:
                     "n_rates": len(needed_by[name]),
                 }
             )
+            in_0 += n_inputs
             self.outputs += outputs
             self.sink_rates += needed_by[name]
 

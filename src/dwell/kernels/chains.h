@@ -16,6 +16,7 @@ template <class S>
 void descend(S& s, i64 key) {
   const i64 cell = cell_of(key), cycle = cycle_of(key), task = item_of(key);
   const Cell& of = s.cell(cell);
+  const Task& to = s.task(cell, task);
   for (i64 chain = 0; chain < of.n_chains; ++chain) {
     Descent& descent = s.descent(cell, cycle, task, chain);
     if (s.chains[of.chain_0 + chain].source == task) {
@@ -23,9 +24,8 @@ void descend(S& s, i64 key) {
       continue;
     }
     descent = kNoDescent;
-    for (i64 flow = 0; flow < of.n_flows; ++flow) {
+    for (i64 flow = to.in_0; flow < to.in_0 + to.n_inputs; ++flow) {
       const Flow& ends = s.flow(cell, flow);
-      if (ends.target != task) continue;
       const i64 from = ends.is_sampled ? value_of(s, s.job(key).site, flow) : cycle;
       if (from == kNoValue) continue;
       const Descent& sent = s.descent(cell, from, ends.source, chain);

@@ -245,15 +245,6 @@ void finish(S& s, i64 cell, i64 cycle, i64 task, const Job& job, i64 now) {
   announce_done(s, cell, cycle, now);
 }
 
-// Number of messages that a task sends in a cycle.
-template <class S>
-i32 sent_by(const S& s, i64 cell, i64 cycle, const Task& from) {
-  if (!S::kRates) return from.n_out;
-  const i32* flows = &s.outputs[from.out_0];
-  return static_cast<i32>(std::count_if(
-      flows, flows + from.n_out, [&](i32 flow) { return s.is_due(s.flow(cell, flow), cycle); }));
-}
-
 // Sends the outputs of a common task to second copies of tasks, or holds them until `after_ns`.
 template <class S>
 [[gnu::noinline]] void send_to_second(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
@@ -280,9 +271,7 @@ template <class S>
 template <class S>
 void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   const Task& from = s.task(cell, task);
-  if (S::kRates || from.n_out > 1) {
-    s.slot(cell, cycle).live += sent_by(s, cell, cycle, from) - 1;
-  }
+  if (from.n_out > 1) s.slot(cell, cycle).live += from.n_out - 1;
   // A shadow receives the outputs of shared tasks too, after the cycle's own outputs.
   const i64 shadow = shared_by(s, cell, cycle, task);
   const bool sends_twice = has_replicas(s, cell, cycle) && is_common(s, cell, cycle, task);
@@ -290,7 +279,10 @@ void send_outputs(S& s, i64 cell, i64 cycle, i64 task, i64 now) {
   while (true) {
     for (i32 i = from.out_0; i < from.out_0 + from.n_out; ++i) {
       const i64 flow = s.outputs[i];
-      if (!s.is_due(s.flow(cell, flow), cycle)) continue;
+      if (!s.is_due(s.flow(cell, flow), cycle)) {
+        if (to == cell) s.slot(cell, cycle).live -= 1;
+        continue;
+      }
       if (to != cell) {
         if (S::kRates && s.flow(cell, flow).is_sampled) continue;
         if (shared_by(s, cell, cycle, s.flow(cell, flow).target) >= 0) continue;

@@ -18,4 +18,12 @@ inline i64 whole_ns(f64 duration) {
   return static_cast<i64>(std::min(duration, static_cast<f64>(kLastNs)));
 }
 
+// The least number of whole nanoseconds that is no shorter than a duration; at most `kLastNs`.
+inline i64 ceil_ns(f64 duration) {
+  // Without SSE4.1, std::ceil takes longer.
+  const f64 most = std::min(duration, static_cast<f64>(kLastNs));
+  const i64 whole = static_cast<i64>(most);
+  return whole + (static_cast<f64>(whole) < most ? 1 : 0);
+}
+
 }  // namespace dwell

@@ -17,7 +17,8 @@ constexpr i64 kUnsent = -1, kHandedOver = -2, kIsHeld = -3;
 // Whether a cycle has two copies.
 template <class S>
 bool has_replicas(const S& s, i64 cell, i64 cycle) {
-  return S::kRates && s.after_ns[s.slot(cell, cycle).candidate] >= 0;
+  if (!S::kRates || s.cell(cell).copies == 0) return false;
+  return s.after_ns[s.slot(cell, cycle).candidate] >= 0;
 }
 
 // Whether a task of a cell is a second copy.

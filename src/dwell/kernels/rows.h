@@ -98,11 +98,13 @@ struct Crossing;  // of meter.cpp
 #define DWELL_CHAIN(field)                                                                       \
   field(i64, source) field(i64, target) field(i64, last) field(i64, max_age_ns)
 
-// A task runs in every `every`-th cycle from 0 on. `n_in` counts its waited inputs. The rates of
-// the sinks to which waited flows lead from it, its own if it is a sink, are in `sink_rates`.
+// A task runs in every `every`-th cycle from 0 on. Its inputs are the `n_inputs` flows of the cell
+// from `in_0` on; `n_in` counts the waited ones. The rates of the sinks to which waited flows lead
+// from it, its own if it is a sink, are in `sink_rates`.
 #define DWELL_TASK(field)                                                                        \
   field(i64, offset_ns) field(i64, every)                                                        \
-  field(i32, n_in) field(i32, n_out) field(i32, out_0) /* in `outputs` */                        \
+  field(i32, n_in) field(i32, in_0) field(i32, n_inputs)                                         \
+  field(i32, n_out) field(i32, out_0) /* in `outputs` */                                         \
   field(i32, rate_0) field(i32, n_rates)
 
 // A flow carries a message in every `every`-th cycle.

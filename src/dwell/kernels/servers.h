@@ -222,7 +222,7 @@ void schedule(S& s, Server& server, i64 now) {
     return;
   }
   if (server.speed != 1.0 && server.speed != 0.0) left = left / server.speed;
-  const i64 wait = std::max<i64>(whole_ns(std::ceil(left - kSlackNs)), 0);
+  const i64 wait = std::max<i64>(ceil_ns(left - kSlackNs), 0);
   announce(s, server, later(now, wait), first.key);
 }
 
