@@ -28,6 +28,7 @@ BENCHMARKS = {
     "passing": ("passing_faults", "measure"),
     "errors": ("stated_errors", "measure"),
     "rates": ("rated_prices", "measure"),
+    "rate-times": ("rated_times", "measure"),
     "placements": ("placements", "measure"),
     "schedulers": ("placements", "schedulers"),
     "all": ("all_candidates", "measure"),
