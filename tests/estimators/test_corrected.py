@@ -419,9 +419,8 @@ def test_a_link_that_loses_nearly_everything() -> None:
 def test_windows_of_any_length(window_cycles: int) -> None:
     problem = cell(estimator="corrected", window_cycles=window_cycles, shadow_fraction=0.2)
     shown = decide(problem, "LOC", max(2, 60 // window_cycles))
-    # In the shortest windows no three jobs tell how many threads a full node has: one a core.
-    threads = 16 if window_cycles < 3 else 20
-    l95_ms = 2.0 + 8.0 + 3.0 * (4 + threads) / 16 + 1.0 + 6.0 + 1.0
+    # In the shortest windows the jobs of several tell how many threads a full node has.
+    l95_ms = 2.0 + 8.0 + 3.0 * (4 + 20) / 16 + 1.0 + 6.0 + 1.0
     assert shown["est_l95_ms_OFF"][-1] == pytest.approx(l95_ms)
     assert shown["est_violation_rate_OFF"][-1] == float(l95_ms > 22.0)
 

@@ -20,6 +20,7 @@ from dwell.estimators.measured import Part, Site
 from dwell.model import (
     Bursts,
     Constant,
+    ControllerSettings,
     Execution,
     Exponential,
     Flow,
@@ -311,6 +312,19 @@ def test_a_backlog_of_earlier_cycles_is_no_foreign_thread(stress: int, every: in
     assert estimator.beyond[-5:] == pytest.approx([stress] * 5, abs=0.1)
     waits_ms = estimator.demands_ms.get(Site("C", "E"), 1.0)
     assert waits_ms == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("stress", [6, 16])
+def test_a_full_node_with_few_jobs_in_each_decision(stress: int) -> None:
+    """A tenth of the cycles has a shadow through OFF: a job in ten, and five in a decision."""
+    problem = chain(stress=stress)
+    settings = ControllerSettings(decide_cycles=5)
+    problem = replace(problem, controller=settings)
+    estimator = Remembering(problem, shadow_fraction=0.1)
+    dwell.simulate(
+        problem, scenario="disturbed", policy="LOC", estimator=estimator, seed=1, windows=5
+    )
+    assert estimator.beyond[-5:] == pytest.approx([stress] * 5, rel=0.05)
 
 
 # ------------------------------------------------------------------- next to jobs of other cells

@@ -64,7 +64,7 @@ def random_beside(rng: np.random.Generator, problem: Problem, evidence: Evidence
 def test_random_windows_say_the_same_in_both(seed: int) -> None:
     rng, cell = np.random.default_rng(seed), Random(seed)
     problem = random_problem(cell, schedulers=EVERY)
-    meter, stretches = Meter(problem), Stretches(problem)
+    meter = Meter(problem)
     for _ in range(4):
         evidence = random_evidence(rng, problem)
         foreign = {name: float(rng.integers(0, 5)) / 2 for name in problem.fabric.nodes}
@@ -72,7 +72,7 @@ def test_random_windows_say_the_same_in_both(seed: int) -> None:
         for name in problem.fabric.nodes:
             own, others = (rng.uniform(0.0, 2.0, 2) * rng.integers(0, 2)).tolist()
             used = full[name] = own, others
-            found = stretches.level(evidence, name, used)
+            found = Stretches(problem).level(evidence, name, used)
             assert found == window_jobs.level(problem, evidence, name, used=used)
             beside = random_beside(rng, problem, evidence)
             evidence.rows.beside = beside

@@ -6,9 +6,12 @@ show it: they take longer than the core time that they receive.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Collection
 from functools import partial
 from typing import NamedTuple
+
+import numpy as np
 
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import (
@@ -19,7 +22,9 @@ from dwell.estimators.measured import (
     message_columns,
 )
 from dwell.kernels.jobs import NodeJobs, SlowedJobs
+from dwell.kernels.meter import WindowRows
 from dwell.model.fabric import Node
+from dwell.model.number_arrays import Ints
 from dwell.model.pipeline import Execution
 from dwell.model.problem import Problem
 
@@ -118,13 +123,18 @@ class Stretches:
     def __init__(self, problem: Problem, shared: Collection[str] = ()) -> None:
         self._problem, self._shared = problem, shared
         self._on: dict[str, SlowedJobs] = {}
+        self._most = round(WINDOWS * problem.decisions_per_window)
+        #: The newest windows since a node is full.
+        self._full: dict[str, deque[Evidence]] = {}
 
     def level(self, evidence: Evidence, name: str, used: UsedCores = NOT_FULL) -> Level | None:
         """Return the estimate from the jobs on a node; None if they allow no estimate.
 
         Own jobs count if there are enough; if not, shadow jobs do, provided that they share the
         remaining cores evenly with foreign threads. `used` has the used cores of a full node:
-        they show jobs of earlier cycles, which the evidence lacks, if a task has a backlog.
+        they show jobs of earlier cycles, which the evidence lacks, if a task has a backlog. If a
+        window has too few jobs, those of the windows before count, too, as long as the node was
+        full.
         """
         rows, is_shared = evidence.rows, name in self._shared
         node = self._problem.fabric.nodes[name]
@@ -133,12 +143,31 @@ class Stretches:
         ):
             return None
         shadows = evidence.shadows_share
-        told = self._jobs_on(name).level(rows, used, shadows=shadows, is_shared=is_shared)
+        jobs, windows = self._jobs_on(name), self._since_full(evidence, name, used)
+        told = jobs.level(rows, used, shadows=shadows, is_shared=is_shared)
+        while told is None and windows and not is_shared:
+            rows = WindowRows(np.concatenate([windows.pop(), rows.table]), rows.tasks, rows.flows)
+            told = jobs.level(rows, used, shadows=shadows)
         if told is None:
             return None
         threads, error, is_slowed = told
         # Instants are rounded to nanoseconds: a tiny number is 0.
         return Level(max(round(threads, 3), 0.0), error, is_slowed)
+
+    def _since_full(self, evidence: Evidence, name: str, used: UsedCores) -> list[Ints]:
+        """Return the tables of the windows before, oldest first, if a node was full since then."""
+        kept = self._full.setdefault(name, deque(maxlen=self._most))
+        table, open_ns = evidence.rows.table, int(evidence.release_ns[0])
+        if kept and (
+            used == NOT_FULL
+            or open_ns > kept[-1].close_ns + self._problem.pipeline.period_ns
+            or kept[-1].rows.table.shape[1] != table.shape[1]
+        ):
+            kept.clear()
+        before = [window.rows.table for window in kept]
+        if used != NOT_FULL:
+            kept.append(evidence)
+        return before
 
     def _jobs_on(self, name: str) -> SlowedJobs:
         if name not in self._on:
