@@ -14,6 +14,7 @@ from dwell.live.stage import Message
 from dwell.live.wire import channels
 from dwell.live.wire.messages import Beat, Header, Stamp, decode
 from dwell.live.wire.transport import Arrival
+from tests.live.rated_cells import SLOW, sampling, world_of
 from tests.live.small_world import MS, Arm, World, canonical, columns
 
 HOUR_NS = 3_600_000 * MS
@@ -57,6 +58,23 @@ def test_nobody_sleeps_until_a_clock_that_was_set_back_is_where_it_was(
     assert hosted.rest_ns() > 0
     now_ns -= HOUR_NS
     assert hosted.rest_ns() <= 0
+
+
+def test_an_actuator_gets_the_cycles_from_which_a_command_descends(
+    monkeypatch: pytest.MonkeyPatch, world: World
+) -> None:
+    sampled, commands, plain = world_of(sampling()), list[Message](), list[Message]()
+    monkeypatch.setattr(sampled.arms["act"], "apply", commands.append)
+    monkeypatch.setattr(world.arm, "apply", plain.append)
+    sampled.run(1_000)
+    world.run(1_000)
+    steady = commands[3 * SLOW :]
+    assert len(steady) > 70
+    for command in steady:
+        picture = (command.cycle - 1) // SLOW * SLOW
+        assert command.origins == {"camera": picture, "imu": command.cycle}
+    # Without sampled flows and chains messages have no origins.
+    assert {len(command.origins) for command in plain} == {0}
 
 
 class Refusing(Arm):

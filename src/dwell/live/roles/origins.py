@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from dwell.live.wire.messages import Completion, Header, Hop, Origin, RatedHop
+from dwell.model import FrozenDict
 
 
 def origins_of(header: Header) -> tuple[Origin, ...]:
     """Return the cycles from which a message descends; none in a cell without origins."""
     sender = header.hops[-1] if header.hops else None
     return sender.origins if isinstance(sender, RatedHop) else ()
+
+
+def cycles_of(header: Header) -> FrozenDict[str, int]:
+    """Return the oldest cycle from which a message descends, by task (`Message.origins`)."""
+    return FrozenDict({one.task: one.cycle for one in origins_of(header)})
 
 
 def joint_origins(headers: Iterable[Header]) -> dict[str, Origin]:

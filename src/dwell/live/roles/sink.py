@@ -7,6 +7,7 @@ from typing import Literal, Protocol, TypeAlias
 
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
+from dwell.live.roles.origins import cycles_of
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.stage import CellActuator, Message
 from dwell.live.wire import channels
@@ -118,8 +119,8 @@ class Sink:
             command = read_payload(header.kind, payload, expected)
             released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
             self._call = f"cycle {stamp.cycle}: apply()", now_ns
-            stamp_ns = self._oldest_ns(header)
-            self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms, stamp_ns))
+            behind = self._oldest_ns(header), cycles_of(header)
+            self.actuator.apply(Message(command, stamp.cycle, released_ns, age_ms, *behind))
         except Exception as error:  # the user's code
             self.trouble = self._complain(f"cycle {stamp.cycle}: apply()", error)
             return False

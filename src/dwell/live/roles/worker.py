@@ -12,7 +12,7 @@ from msgspec.structs import asdict
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN, Counts
 from dwell.live.roles.joins import MAX_JOINS, Job, Joins
-from dwell.live.roles.origins import joint_origins, origins_of
+from dwell.live.roles.origins import cycles_of, joint_origins
 from dwell.live.roles.replicated_cycles import ReplicatedCycles
 from dwell.live.roles.role import BeatState, Pulse, RolePlace
 from dwell.live.roles.sampled_inputs import SampledInputs
@@ -39,7 +39,6 @@ from dwell.live.wire.payloads import read_payload, write_payload
 from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import lane_of, longest_bytes
-from dwell.model import FrozenDict
 from dwell.model.instants import EVIDENCE_NS, NEVER_NS
 
 #: Periods between two beats of a shadow worker.
@@ -439,9 +438,8 @@ class Worker:
         stamp = header.stamp
         released_ns, _ = self.offsets.from_reference(self.place.node, stamp.released_ns)
         data = read_payload(header.kind, payload, self.stage.inputs.get(source))
-        origins = {one.task: one.cycle for one in origins_of(header)}
         age_ms = (started_ns - released_ns) / 1e6
-        return Message(data, stamp.cycle, released_ns, age_ms, origins=FrozenDict(origins))
+        return Message(data, stamp.cycle, released_ns, age_ms, origins=cycles_of(header))
 
     def finish(
         self, job: Job, output: Message | None, started_ns: int, ended_ns: int, state_age: int = -1
