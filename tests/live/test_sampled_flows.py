@@ -348,6 +348,24 @@ def test_recorded_ages_are_those_of_the_jobs(tmp_path: Path) -> None:
     assert any(missed for _, _, missed, _ in windows)
 
 
+def test_ages_after_a_move_of_the_guard_count_from_the_newest_data_before_it() -> None:
+    chains = {"see-act": {"from": "camera", "to": "act"}}
+    controller = {"on": "E", "initial": "AWAY", "fallbacks": ["LOC"]}
+    world, log = logged(sampling(chains=chains, controller=controller), policy=Staying())
+    world.run(600)
+    # The first jobs after the move have no value.
+    world.network.cut("control@E", "control@R")
+    run_up_to_a_picture(world)
+    world.run(P_MS)
+    world.move_by_guard("LOC")
+    world.run(500)
+    assert log.samples[-60:].count(None) >= 3
+    names = "placement", "lead", "age_l95_see-act"
+    windows = columns(world, "windows", *names)
+    (after,) = (age_ms for placed, lead, age_ms in windows if placed == "LOC" and lead)
+    assert after < 2 * SLOW * P_MS
+
+
 def test_a_cycle_whose_data_are_too_old_is_missed() -> None:
     world, _ = logged(sampling(chains=CHAINS), policy=Staying())
     world.run(1_000)

@@ -85,7 +85,7 @@ class DataAges:
         return round(self._censor_ms * 1e6) * (self._weighs_age or self._latency is not None)
 
     def closed(self, cycles: Sequence[LiveCycle]) -> None:
-        """Record a window whose end has come."""
+        """Record the cycles of a window, or between windows, whose end has come."""
         self.known = self.after(cycles, self.known)
 
     def after(

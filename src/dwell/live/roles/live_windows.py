@@ -549,9 +549,12 @@ class LiveWindows:
 
     def _drop(self, end: int) -> None:
         """Record the cycles before a place in the line as lead."""
-        for cycle in self._line[self._window.at : end]:
+        lead = self._line[self._window.at : end]
+        for cycle in lead:
             self._ledger.settle(cycle)
-        self._symptoms.led(self._line[self._window.at : end])
+        self._symptoms.led(lead)
+        if lead:
+            self.record.ages.closed(lead)
         self._lead += max(end - self._window.at, 0)
         self._take_off(end)
 

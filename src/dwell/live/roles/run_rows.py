@@ -292,7 +292,8 @@ class RunRows:
         cycles, names = window.cycles, self._controller.resources
         before = self._windows.get(window.number - 1)
         known = window.known_origins
-        if before is not None:
+        # Cycles between the windows are not kept.
+        if before is not None and not window.lead:
             known = self.ages.after(before.cycles, before.known_origins)
         busy, _, by_shadows = window.used.tolist()
         seen_l95_ms, seen_violation_rate, cost = map(_known, window.seen)
