@@ -35,6 +35,19 @@ def test_check_as_json(cell: Path) -> None:
     assert found["candidates"]["OFF"]["own_work"] == pytest.approx({"R": 0.05, "E": 0.025})
 
 
+def test_check_shows_all_that_j_and_caps_look_at(cell: Path) -> None:
+    objective = (
+        "objective: {weights: {age: 1}, targets: {age_ms: 50}, caps: {misses: {m: 1, k: 20}}}"
+    )
+    cell.write_text(f"{SMALL}\n{objective}\n", encoding="utf-8")
+    found = read_json(call("check", cell, "--json"))["candidates"]["OFF"]
+    # A latency of 4 ms, and half of 20 ms.
+    assert found["age_ms"] == pytest.approx(14)
+    assert (found["age_error_ms"], found["misses"]) == (0.0, 0.0)
+    rows = [line.split() for line in call("check", cell).stdout.splitlines()]
+    assert ["OFF", "4.0", "0.00", "5", "2", "14.0", "0.00"] in rows
+
+
 @pytest.mark.parametrize(("estimator", "windows"), [("profile", 3), ("corrected", 0)])
 def test_check_says_how_often_it_decides_and_how_long_it_stays(
     cell: Path, estimator: str, windows: int

@@ -168,10 +168,18 @@ def _priced(problem: Problem, prices: Mapping[str, Price]) -> dict[str, Any]:
             "own_work": dict(prices[name].own),
             "cycles": prices[name].cycles,
             "is_settled": prices[name].is_settled,
+            **_further(prices[name]),
             **placement_prices(problem, placement, prices[name].price_per_hour),
         }
         for name, placement in problem.candidates.items()
     }
+
+
+def _further(price: Price) -> dict[str, float]:
+    """Return what J and caps need beyond L95, V_D and utilisation, by name."""
+    age_ms, age_error_ms = price.age or (None, None)
+    values = {"age_ms": age_ms, "age_error_ms": age_error_ms, "misses": price.misses}
+    return {name: value for name, value in values.items() if value is not None}
 
 
 def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> str:
@@ -192,7 +200,10 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
     }
     priced = [METRICS[column] for column in next(iter(money.values()))]
     used = [f"{one} (%)" for one in resources]
+    age, cap = METRICS["seen_age_ms"], problem.objective.caps.misses
     head = ["candidate", l95.heading, rate.heading, *used, *(one.heading for one in priced)]
+    head += [age.heading] if problem.objective.weighs_age else []
+    head += [] if cap is None else [f"over {cap.m} in {cap.k} (%)"]
     rows = [
         [
             name,
@@ -200,11 +211,15 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             with_error(rate.number(price.violation_rate), price.violation_error * 100),
             *(f"{price.own[one] * 100:.0f}" for one in resources),
             *(metric.number(money[name][metric.column]) for metric in priced),
+            *([] if price.age is None else [with_error(milliseconds(price.age[0]), price.age[1])]),
+            *([] if price.misses is None else [f"{price.misses * 100:.2f}"]),
         ]
         for name, price in prices.items()
     ]
     controller, least = problem.controller, counted(problem.min_dwell, "window")
     span_s = min(price.cycles for price in prices.values()) * pipeline.period_ms / 1e3
+    chain = problem.objective.latency
+    of = "" if chain is None else f" of the age of {chain}"
     disturbed = f" for {span_s:.4g} s" if problem.scenario(scenario) else ""
     return "\n".join(
         (
@@ -218,9 +233,9 @@ def _summary(problem: Problem, prices: Mapping[str, Price], scenario: str) -> st
             f"can move: {', '.join(movable) or 'nothing'}",
             f"scenarios: {', '.join(problem.scenarios)}",
             "",
-            f"{scenario[0].upper()}{scenario[1:]}, each simulated alone{disturbed}: L95 (at most "
-            f"{milliseconds(problem.censor_ms)} ms) and V_D of a window with standard errors, and "
-            f"the cell's own work on each {what}",
+            f"{scenario[0].upper()}{scenario[1:]}, each simulated alone{disturbed}: L95{of} (at "
+            f"most {milliseconds(problem.censor_ms)} ms) and V_D of a window with standard errors, "
+            f"and the cell's own work on each {what}",
             aligned(head, rows),
             *(f"{name}: {note}" for name, price in prices.items() for note in _notes(price)),
         )
