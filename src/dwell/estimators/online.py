@@ -79,7 +79,7 @@ class Online(CellEstimator):
         self._grown = self._until = 1
         self._plays = False
         self._patience_ns = task_patience_ns(problem)
-        self._sent = {name: self._sent_under(name) for name in problem.candidates}
+        self._sent = self._sent_shares()
         #: Price and work of each candidate as declared, cached at the first estimate.
         self._declared: dict[str, tuple[QoS, list[tuple[str, float]]]] = {}
         #: The last window until `estimate` uses it, and until its demands are learnt.
@@ -103,10 +103,10 @@ class Online(CellEstimator):
         for link, rate in self._rates.items():
             self._meter.set_rate(link, rate.mbps)
         self._stretches = Stretches(self.problem, self._shared)
-        for name in self.problem.candidates:
+        for name, sent in self._sent_shares().items():
             of = {
                 one: share / cells if one.partition(".")[0] in shared else share
-                for one, share in self._sent_under(name).items()
+                for one, share in sent.items()
             }
             self._sent[name] = FrozenDict(of)
 
@@ -417,23 +417,26 @@ class Online(CellEstimator):
             self.revision += 1
             self._until *= 2
 
-    def _sent_under(self, name: str) -> Mapping[str, float]:
-        """Return the share of each resource that shadow jobs take under a candidate."""
+    def _sent_shares(self) -> dict[str, Mapping[str, float]]:
+        """Return the share of each resource that shadow jobs take, by the active candidate."""
         problem, placed = self.problem, self.problem.candidates
-        here, names = placed[name], [*placed]
         pipeline, resources = problem.pipeline, problem.fabric.resources
-        fraction = by_candidate(self.shadow_fraction, problem.candidates)[name]
-        share, rates = dict.fromkeys(resources, 0.0), pipeline.rates
-        for there in (placed[names[i]].first for i in alternatives(placed)[names.index(name)]):
-            apart = pipeline.diverging(here, there)
-            # In the order of tasks: the order of a set, and the rounding of the sum, may differ.
-            for task in pipeline.tasks:
-                if task not in apart or not pipeline.outputs(task):
-                    continue
-                execution = pipeline.tasks[task].on[there[task]]
-                resource = execution.resource(there[task])
-                threads = execution.threads if execution.accelerator is None else 1
-                busy_ms = mean_ms(pipeline, pipeline.tasks[task], execution) * threads / rates[task]
-                capacity = resources[resource].capacity
-                share[resource] += fraction * busy_ms / pipeline.period_ms / capacity
-        return FrozenDict(share)
+        fractions, names = by_candidate(self.shadow_fraction, placed), [*placed]
+        rates, found = pipeline.rates, dict[str, Mapping[str, float]]()
+        for name, others in zip(names, alternatives(placed), strict=True):
+            share = dict.fromkeys(resources, 0.0)
+            for there in (placed[names[i]].first for i in others if fractions[name]):
+                apart = pipeline.diverging(placed[name], there)
+                # In the order of tasks: the order of a set, and so the rounding, may differ.
+                for task in pipeline.tasks:
+                    if task not in apart or not pipeline.outputs(task):
+                        continue
+                    execution = pipeline.tasks[task].on[there[task]]
+                    resource = execution.resource(there[task])
+                    threads = execution.threads if execution.accelerator is None else 1
+                    mean = mean_ms(pipeline, pipeline.tasks[task], execution)
+                    busy_ms = mean * threads / rates[task]
+                    capacity = resources[resource].capacity
+                    share[resource] += fractions[name] * busy_ms / pipeline.period_ms / capacity
+            found[name] = FrozenDict(share)
+        return found
