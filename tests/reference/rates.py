@@ -97,5 +97,7 @@ def earlier_cycles(problem: Problem) -> int:
     pipeline, slowest = problem.pipeline, max(Rates(problem.pipeline).of.values())
     if slowest == 1:
         return 0
-    deadlines = math.ceil(pipeline.deadline_ms / pipeline.period_ms)
-    return min(2 * slowest, problem.window_cycles - 1) + 2 * deadlines
+    settings = problem.controller
+    order_ms = 2 * pipeline.deadline_ms + settings.order_delay_ms
+    order = settings.order_lead_cycles + math.ceil(order_ms / pipeline.period_ms)
+    return min(2 * slowest, problem.window_cycles - 1) + order

@@ -317,9 +317,9 @@ class Problem(Displayed):
         pipeline, slowest = self.pipeline, max(self.pipeline.rates.values())
         if slowest == 1:
             return 0
-        return self.patience_cycles(slowest) + 2 * math.ceil(
-            pipeline.deadline_ms / pipeline.period_ms
-        )
+        order_ms = 2 * pipeline.deadline_ms + self.controller.order_delay_ms
+        order = self.controller.order_lead_cycles + math.ceil(order_ms / pipeline.period_ms)
+        return self.patience_cycles(slowest) + order
 
     @property
     def decisions_per_window(self) -> float:
