@@ -130,7 +130,8 @@ def require_playable_scenario(problem: Problem, scenario: str, *, outages: bool)
     down = [item.place for item in problem.scenario(scenario) if item.down]
     if down and not outages:
         faults = "; ".join(f"{place} cannot be taken down here" for place in down)
-        raise LiveError(f"scenario {scenario!r} cannot be played: {faults}")
+        instead = "a link with a loss of 0.99 can be played, and `dwell testbed run` plays outages"
+        raise LiveError(f"scenario {scenario!r} cannot be played: {faults}; {instead}")
 
 
 def _without_bursts(problem: Problem) -> Problem:
