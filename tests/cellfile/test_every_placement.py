@@ -85,5 +85,5 @@ def test_a_search_refuses_objectives_that_it_does_not_support(
 ) -> None:
     (fault,) = faults_of_document({**with_candidates("all"), "objective": objective})
     assert fault.path == f"objective.{key}"
-    assert "the search of `candidates` does not support it" in fault.message
+    assert "the search of placements does not support it" in fault.message
     assert from_document({**with_candidates(TO), "objective": objective}).objective.beyond_cycles

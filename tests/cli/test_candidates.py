@@ -53,6 +53,23 @@ def test_several_scenarios(cell: Path) -> None:
     assert all(costs[name] >= one["cost"] for name, one in alone["candidates"].items())
 
 
+@pytest.mark.parametrize(
+    ("objective", "key"),
+    [
+        ("latency: reaction", "latency"),
+        ("weights: {age: 1}, targets: {age_ms: 50}", "weights.age"),
+        ("caps: {misses: {m: 1, k: 20}}", "caps.misses"),
+    ],
+)
+def test_an_objective_that_a_search_does_not_support_is_a_fault_of_the_file(
+    cell: Path, objective: str, key: str
+) -> None:
+    chain = "chains:\n  reaction: {from: sense, to: plan}\n"
+    cell.write_text(f"{SMALL}{chain}objective: {{{objective}}}\n", encoding="utf-8")
+    refused = call("candidates", cell)
+    assert_refused(refused, f"{cell}: objective.{key}: the search of placements does not support")
+
+
 @pytest.mark.parametrize("option", ["--scenario", "--scenarios"])
 def test_an_unknown_scenario_is_refused(cell: Path, option: str) -> None:
     assert_refused(call("candidates", cell, option, "rain"), "unknown scenario 'rain'")

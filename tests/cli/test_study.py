@@ -12,7 +12,7 @@ import pytest
 from dwell.report.formatting import shown_policy
 from dwell.study.parts import BATCH_RUNS
 from dwell.study.reference import REFERENCES
-from tests.cli.small_cell import assert_refused, call, interrupt_at_first_sign, read_json
+from tests.cli.small_cell import SMALL, assert_refused, call, interrupt_at_first_sign, read_json
 
 STUDY = """\
 dwell-study: 1
@@ -99,6 +99,34 @@ def test_every_fault_of_a_study_is_printed(study: Path) -> None:
         "parameters.objective.weights.switching[1]:",
     ]
     assert not Path("studies").exists()
+
+
+@pytest.mark.parametrize(
+    ("objective", "key"),
+    [
+        ("latency: reaction", "latency"),
+        ("weights: {age: 1}, targets: {age_ms: 50}", "weights.age"),
+        ("weights: {price: 1}, targets: {price_per_hour: 1}", "weights.price"),
+        ("caps: {misses: {m: 1, k: 20}}", "caps.misses"),
+    ],
+)
+def test_an_objective_that_references_do_not_support_is_a_fault_of_the_file(
+    cell: Path, study: Path, objective: str, key: str
+) -> None:
+    chain = "chains:\n  reaction: {from: sense, to: plan}\n"
+    priced = SMALL.replace("delay_ms: 1}", "delay_ms: 1, price_per_gb: 1}")
+    cell.write_text(f"{priced}{chain}objective: {{{objective}}}\n", encoding="utf-8")
+    refused = call("study", study)
+    assert_refused(refused, f"{study}:6: references: references do not support objective.{key} of")
+    assert not Path("studies").exists()
+
+
+def test_references_do_not_support_idle_cycles(cell: Path, study: Path) -> None:
+    cell.write_text(
+        SMALL.replace("plan: {on", "plan: {every: 2, on").replace("plan}", "plan, sampled: true}"),
+        encoding="utf-8",
+    )
+    assert_refused(call("study", study), f"{study}:6: references: references do not support cell")
 
 
 def test_a_folder_of_another_study_is_refused(study: Path) -> None:

@@ -12,7 +12,8 @@ import pytest
 
 from dwell.cellfile.study_paths import with_settings
 from dwell.errors import DwellError, ProblemError, SimulationError
-from dwell.model import Constant, Problem
+from dwell.model import Constant, Problem, evolve
+from dwell.model.objective import MissCap
 from dwell.policies import Static
 from dwell.study import Contender, Point, Study
 from tests.cells.small import make_problem
@@ -72,6 +73,14 @@ def grid(*, dwells: range, delays: range) -> tuple[Point, ...]:
             {"contenders": (Contender("oracle", "dtp"),), "references": True},
             SimulationError,
             "'oracle' is a reference's name",
+        ),
+        (
+            {
+                "points": (Point({}, evolve(PROBLEM, {"objective.caps.misses": MissCap(1, 20)})),),
+                "references": True,
+            },
+            ProblemError,
+            "references do not support objective.caps.misses",
         ),
         (
             {"points": (Point({"a": 1}, PROBLEM), Point({"b": 1}, PROBLEM))},

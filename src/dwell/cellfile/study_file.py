@@ -136,6 +136,8 @@ class _Reading:
             return None
         windows = WINDOWS if entry.windows is None else entry.windows
         self._check_windows(windows, plays.cells)
+        for cell in plays.cells if entry.references else ():
+            self.faults.attempt("references", cell.require_simple, "references")
         return DeclaredStudy(
             name=name,
             points=plays.points,

@@ -12,6 +12,7 @@ import dwell
 from dwell.cli.options import CellArgument, Json, Scenario, Seed, Traces, flag, option
 from dwell.cli.output import aligned, print_json, with_error
 from dwell.cli.placement_prices import placement_prices
+from dwell.errors import ProblemError
 from dwell.model.bounds import counted
 
 if TYPE_CHECKING:
@@ -49,6 +50,10 @@ def candidates(
     from dwell.estimators.placement_search import rank, rank_until_apart
 
     problem = dwell.load(cell, traces=traces)
+    try:
+        problem.objective.require_searchable()
+    except ProblemError as error:
+        raise ProblemError(error.faults, str(cell)) from None
     names = (scenario,) if scenarios is None else tuple(dict.fromkeys(scenarios.split(",")))
     if cycles is None:
         ranking = rank_until_apart(problem, names, seed=seed, top=top)

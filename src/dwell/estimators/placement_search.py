@@ -122,11 +122,11 @@ def search(
     Raises
     ------
     ProblemError
-        If the scenario does not exist.
+        If the scenario does not exist, or the objective has ages or a cap on misses.
     PlacementError
         If no placement is feasible; with the reasons.
     SimulationError
-        If `cycles`, `seed` or `top` is out of range, or the objective has ages or a cap on misses.
+        If `cycles`, `seed` or `top` is out of range.
     """
     ranking = rank(problem, (scenario,), cycles=cycles, seed=seed, top=top)
     return [(one.placement, one.qos, one.cost) for one in ranking.best]
@@ -145,11 +145,7 @@ def rank(
 
     `most` is the largest number of partial placements to look at.
     """
-    if name := problem.objective.beyond_cycles:
-        raise SimulationError(
-            f"cell {problem.name!r} has objective.{name}, which the search of placements does not "
-            "support; remove it, or list the candidates"
-        )
+    problem.objective.require_searchable()
     for name, value, least in (("cycles", cycles, 1), ("seed", seed, 0), ("top", top, 1)):
         if isinstance(value, bool) or value < least:
             raise SimulationError(

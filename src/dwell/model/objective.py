@@ -163,6 +163,18 @@ class Objective:
         }
         return next((name for name, there in given.items() if there), "")
 
+    def require_searchable(self) -> None:
+        """Refuse keys that the search of placements does not support.
+
+        Raises
+        ------
+        ProblemError
+            If it has one.
+        """
+        if name := self.beyond_cycles:
+            message = "the search of placements does not support it; remove it, or list candidates"
+            raise ProblemError([Fault(f"objective.{name}", message)])
+
     @property
     def weighs_age(self) -> bool:
         """Whether J has a term of the mean age."""

@@ -132,13 +132,32 @@ class Problem(Displayed):
         )
 
     def _require_searchable(self) -> None:
-        """Refuse objectives that the search of placements does not support."""
-        name = self.objective.beyond_cycles
-        if self.is_searched and name:
-            message = (
-                "the search of `candidates` does not support it; remove it, or list candidates"
+        """Refuse an objective that the search of placements does not support."""
+        if self.is_searched:
+            self.objective.require_searchable()
+
+    def require_simple(self, what: str) -> None:
+        """Refuse cells that some features do not support; `what` names the features.
+
+        These are cells in which no sink is due in some cycles, and objectives with ages, prices or
+        a cap on misses.
+
+        Raises
+        ------
+        ProblemError
+            If it is such a cell.
+        """
+        if self.pipeline.has_idle_cycles:
+            raise ProblemError(
+                f"{what} do not support cell {self.name!r}, because no sink is due in some of its "
+                "cycles; let a sink run in each cycle, or leave them out"
             )
-            raise ProblemError([Fault(f"objective.{name}", message)])
+        priced = "weights.price" if self.objective.weighs_price else ""
+        if name := self.objective.beyond_cycles or priced:
+            raise ProblemError(
+                f"{what} do not support objective.{name} of cell {self.name!r}; remove it, or "
+                "leave them out"
+            )
 
     def _require_due_sinks(self) -> None:
         """Refuse windows in which a sink never runs, and camera frames in cells with rates."""

@@ -71,25 +71,6 @@ class _Alone:
         }
 
 
-def require_supported(problem: Problem, what: str) -> None:
-    """Raise a SimulationError for cells that `what` does not support.
-
-    These are cells in which no sink is due in some cycles, and objectives with ages, prices or a
-    cap on misses.
-    """
-    if problem.pipeline.has_idle_cycles:
-        raise SimulationError(
-            f"{what} do not support cell {problem.name!r}, because no sink is due in some of its "
-            "cycles; let a sink run in each cycle, or leave them out"
-        )
-    objective = problem.objective
-    if name := objective.beyond_cycles or ("weights.price" if objective.weighs_price else ""):
-        raise SimulationError(
-            f"{what} do not support objective.{name} of cell {problem.name!r}; remove it, or leave "
-            "them out"
-        )
-
-
 class Hindsight:
     """Estimates every candidate by its metrics in the same cycles of its static run.
 
@@ -117,9 +98,11 @@ class Hindsight:
         Raises
         ------
         SimulationError
-            If the static run of a candidate is missing, or the cell is not supported.
+            If the static run of a candidate is missing.
+        ProblemError
+            If the cell is not supported (see `Problem.require_simple`).
         """
-        require_supported(problem, "estimates in hindsight")
+        problem.require_simple("estimates in hindsight")
         missing = [name for name in problem.candidates if name not in self._alone]
         if missing:
             raise SimulationError(

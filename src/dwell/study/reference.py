@@ -37,7 +37,6 @@ from dwell.model.number_arrays import Floats, Mask
 from dwell.model.window_close import window_close_ns
 from dwell.policies.registry import estimator_of
 from dwell.study.clairvoyant import Sequence, clairvoyant, priced
-from dwell.study.hindsight import require_supported
 from dwell.study.oracle import expected_costs
 from dwell.study.script import Script, is_up
 from dwell.study.summary import mean_of, used_in
@@ -140,12 +139,14 @@ def references(problem: Problem, realisation: Realisation) -> References:
     Raises
     ------
     SimulationError
-        If the controller sees no window after the warm-up, a candidate has the name of a
-        reference, or the cell is not supported (see `require_supported`).
+        If the controller sees no window after the warm-up, or a candidate has the name of a
+        reference.
+    ProblemError
+        If the cell is not supported (see `Problem.require_simple`).
     """
     from dwell.sim import simulate_realisation
 
-    require_supported(problem, "references")
+    problem.require_simple("references")
     names = tuple(problem.candidates)
     if taken := set(REFERENCES) & set(names):
         raise SimulationError(

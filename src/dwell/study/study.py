@@ -172,7 +172,8 @@ class Study:
     SimulationError
         If a value is invalid or a name is ambiguous.
     ProblemError
-        If a scenario is unknown, or a run is too long for 64 bits (see `Problem.cycles_of`).
+        If a scenario is unknown, a run is too long for 64 bits (see `Problem.cycles_of`), or the
+        references do not support a cell (see `Problem.require_simple`).
     """
 
     name: str
@@ -240,6 +241,8 @@ class Study:
         for scenario in self.scenarios:
             problem.scenario(scenario)
         problem.cycles_of(self.windows)
+        if self.references:
+            problem.require_simple("references")
         if self.windows <= problem.warmup_windows:
             raise SimulationError(
                 f"windows is {self.windows}; it must be more than the "
