@@ -55,6 +55,7 @@ BENCHMARKS = {
     "page-cost": ("page_cost", "measure"),
     "live-fleet": ("fleet_live", "measure"),
     "restart": ("restart", "measure"),
+    "kills": ("rated_live", "measure"),
     "leaving": ("leaving", "measure"),
     "ros": ("ros_ends", "measure"),
 }
