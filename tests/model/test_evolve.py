@@ -8,7 +8,7 @@ import pytest
 
 import dwell
 from dwell.errors import ProblemError
-from dwell.model import Caps, Constant, LogNormal, evolve
+from dwell.model import Caps, Chain, Constant, LogNormal, Node, Placement, evolve
 
 CANONICAL = dwell.load(Path(__file__).parents[2] / "examples" / "canonical.yaml")
 
@@ -44,6 +44,58 @@ def test_values_of_every_part() -> None:
     assert found.candidates == CANONICAL.candidates
 
 
+CHAIN = {"from": "sensing", "to": "control", "max_age_ms": 200}
+
+
+def test_mappings_become_the_parts_that_they_describe() -> None:
+    chains = {"reaction": Chain("sensing", "control", 200.0)}
+    assert evolve(CANONICAL, {"chains": {"reaction": CHAIN}}).pipeline.chains == chains
+    assert evolve(CANONICAL, {"chains.reaction": CHAIN}).pipeline.chains == chains
+    by_key = {f"chains.reaction.{name}": value for name, value in CHAIN.items()}
+    assert evolve(CANONICAL, by_key).pipeline.chains == chains
+    flows = [{"from": one.source, "to": one.target} for one in CANONICAL.pipeline.flows]
+    found = evolve(CANONICAL, {"flows": flows, "nodes.E": {"tier": "edge", "cores": 3.0}})
+    assert [one.target for one in found.pipeline.flows] == [one["to"] for one in flows]
+    assert found.fabric.nodes["E"] == Node("E", "edge", 3)
+    placed = dict(CANONICAL.candidates["SO"])
+    found = evolve(CANONICAL, {"candidates.LOC": placed, "candidates.HYB.planning": "R2"})
+    assert found.candidates["LOC"] == Placement(placed)
+    assert found.candidates["HYB"].first["planning"] == "R2"
+    assert evolve(CANONICAL, {"scales.scene": 2}).pipeline.scales["scene"] == Constant(2.0)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "fault"),
+    [
+        ("chains", 3, "chains: 3 is not allowed; it must be a mapping"),
+        ("chains", {"a": 3}, "chains.a: 3 is not allowed; it must be of the type `Chain`, or a"),
+        ("chains", {"a": {"form": "x"}}, "chains.a.form: unknown key 'form'; did you mean 'from'?"),
+        ("chains.a", {"from": "sensing"}, "chains.a.to: missing; add it"),
+        ("chains.a.from", "sensing", "chains.a.to: missing; add it"),
+        ("chains", {"a": {**CHAIN, "max_age_ms": 0}}, "chains.a.max_age_ms: 0 is not allowed"),
+        ("nodes.R2.bursts.threads", 1, "nodes.R2.bursts.every_ms: missing; add it"),
+        ("objective", None, "objective: None is not allowed"),
+        ("objective.caps", {"latncy": 3}, "objective.caps.latncy: unknown key 'latncy'"),
+        ("objective.caps.misses", {"m": 1}, "objective.caps.misses.k: missing; add it"),
+        ("objective.caps.misses", 3, "objective.caps.misses: 3 is not allowed"),
+        ("flows", CHAIN, "flows: {'from': .* is not allowed; it must be a list"),
+        ("links[0].delay_ms", "x", r"links\[0\].delay_ms: 'x' is not allowed; .* `Process`"),
+        ("links[0]", {"from": "R1"}, r"links\[0\].to: missing; add it"),
+        ("tasks.perception.on.E", 3, "tasks.perception.on.E: 3 is not allowed"),
+        ("scenarios.baseline", [3], r"scenarios.baseline\[0\]: 3 is not allowed; .* `NodeDist"),
+        ("candidates.LOC", 3, "candidates.LOC: 3 is not allowed; .* `Placement`"),
+        ("candidates.LOC", {"planning": 3}, "candidates.LOC: .* must be a non-empty name"),
+        ("candidates.LOC.planning", "Q", "candidates.LOC.planning: unknown node .Q."),
+        ("controller.fallbacks", "LOC", "controller.fallbacks: 'LOC' is not allowed; .* a list"),
+    ],
+)
+def test_a_value_of_another_type_is_told_with_its_field(
+    path: str, value: object, fault: str
+) -> None:
+    with pytest.raises(ProblemError, match=f"^{fault}"):
+        evolve(CANONICAL, {path: value})
+
+
 @pytest.mark.parametrize(
     ("path", "value", "told"),
     [
@@ -70,3 +122,10 @@ def test_what_is_drawn_is_equal_where_only_settings_differ() -> None:
     assert found.drawn == CANONICAL.drawn
     assert hash(found.drawn) == hash(CANONICAL.drawn)
     assert evolve(CANONICAL, {"nodes.E.cores": 7}).drawn != CANONICAL.drawn
+
+
+def test_a_candidate_with_two_copies_is_given_whole() -> None:
+    problem = dwell.load(Path(__file__).parents[2] / "examples" / "replicas.yaml")
+    with pytest.raises(ProblemError, match=r"^candidates.NOW: .* give it whole, as `Replicas`"):
+        evolve(problem, {"candidates.NOW.after_ms": 3})
+    assert evolve(problem, {"window_cycles": 40}).candidates == problem.candidates
