@@ -84,6 +84,16 @@ def test_the_target_of_a_chain_that_counts_as_latency_is_its_largest_age() -> No
     assert target_ms({}) == target_ms({"latency": "free"}) == 10
 
 
+@pytest.mark.parametrize("max_age_ms", [1e12, 1e-12])
+def test_an_age_that_cannot_be_the_target_is_a_fault_of_the_chain(max_age_ms: float) -> None:
+    chain = {"from": "camera", "to": "control", "max_age_ms": max_age_ms}
+    (fault,) = faults({**cell(see=chain), "objective": {"latency": "see"}})
+    assert fault.startswith(f"chains.see.max_age_ms: {max_age_ms} is not allowed; it must be a")
+    assert "objective.targets.latency_ms" in fault
+    given = {"latency": "see", "targets": {"latency_ms": 50}}
+    assert from_document({**cell(see=chain), "objective": given}).objective.latency == "see"
+
+
 def test_chains_have_columns_of_windows() -> None:
     problem = from_document(cell(see={"from": "camera", "to": "control"}))
     columns = [name for name in column_types("windows", problem) if name.endswith("_see")]

@@ -42,6 +42,7 @@ from dwell.model.bounds import CLASS_PATH, require
 from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
+from dwell.model.objective import TARGET
 from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.replicated import Replicated
 from dwell.model.semantics import (
@@ -299,12 +300,17 @@ class Assembly:
         entry = self.entry.objective or Entry(OBJECTIVE, "objective", {})
         target_ms = self.entry.deadline_ms or self.entry.period_ms
         chain = chains.get(entry.latency) if entry.latency is not None else None
-        if chain is not None and chain.is_bounded:
+        given = entry.targets.values if entry.targets is not None else {}
+        if chain is not None and chain.is_bounded and "latency_ms" not in given:
             target_ms = chain.max_age_ms
+            place = f"chains.{entry.latency}.max_age_ms"
+            bound = f"{TARGET} to be the target of latency; or give objective.targets.latency_ms"
+            self.faults.attempt("", require, TARGET.holds(target_ms), place, target_ms, bound)
+            if self.faults.at(place):
+                return None
         tiers = entry.tiers
         if tiers is None:
             tiers = {name: node.tier for name, node in nodes.items() if node is not None}
-        given = entry.targets.values if entry.targets is not None else {}
         targets = self._make(entry, Targets, **{"latency_ms": target_ms, **given})
         weights, caps = self._made(entry.weights), self._made(entry.caps)
         if targets is None:
