@@ -360,6 +360,16 @@ def test_a_loop_is_stable_up_to_its_longest_delay(
     assert (late > 2 * early or math.isinf(late)) is grows
 
 
+def test_a_loop_with_rare_commands_has_half_their_interval_as_delay() -> None:
+    """12 and 32 ms of latency: without the interval of 600 ms the loop would be stable."""
+    rare = servo(6, delay_ms=0)
+    assert not warned(rare)
+    rare["tasks"] = {**rare["tasks"], "cam": {"every": 6, **rare["tasks"]["cam"]}}
+    loops = [one for one in warned(rare) if one.path == "servo.gain"]
+    delays = [re.search(r"under (\w+) .* is ([\d.]+) ms", one.message) for one in loops]
+    assert [one.groups() for one in delays if one] == [("LOC", "332"), ("SO", "312")]
+
+
 @pytest.mark.parametrize("name", CELLS)
 def test_the_examples_have_no_warning(name: str) -> None:
     assert not list(warnings_of(dwell.load(EXAMPLES / f"{name}.yaml")))

@@ -608,19 +608,22 @@ def _shortest(process: Process) -> float:
 def _unstable_loops(problem: Problem, profile: Profile) -> Iterator[Fault]:
     """Yield candidates under which the servo loop is unstable.
 
-    The delay of the loop is the mean latency plus half a period, the average time since a command.
+    The delay of the loop is the mean latency plus half the time between two commands, the average
+    time since a command.
     """
     if problem.servo is None:
         return
+    apart_ms = problem.pipeline.due_interval * problem.pipeline.period_ms
     for name, alone in profile.prices.items():
-        delay_s = (alone.latency_ms + problem.pipeline.period_ms / 2) / 1e3
+        delay_s = (alone.latency_ms + apart_ms / 2) / 1e3
         most_s = longest_delay_s(problem.servo)
         if delay_s > most_s:
             yield Fault(
                 "servo.gain",
-                f"under {name} the loop is not stable: its delay, the mean latency and half a "
-                f"period, is {delay_s * 1e3:.4g} ms, and may be {most_s * 1e3:.4g} at most with "
-                f"gain {problem.servo.gain:g}; lower it, or drop the candidate",
+                f"under {name} the loop is not stable: its delay, the mean latency and half of "
+                f"the {apart_ms:g} ms between commands, is {delay_s * 1e3:.4g} ms, and may be "
+                f"{most_s * 1e3:.4g} at most with gain {problem.servo.gain:g}; lower it, or drop "
+                "the candidate",
             )
 
 
