@@ -10,7 +10,7 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.cost import price
-from dwell.errors import ProblemError, SimulationError
+from dwell.errors import ProblemError
 from dwell.model import (
     Caps,
     Chain,
@@ -233,9 +233,9 @@ def test_references_refuse_what_they_cannot_price(key: str) -> None:
         "caps.misses": replace(problem.objective, caps=Caps(misses=MissCap(1, 20))),
     }[key]
     problem = replace(problem, objective=objective)
-    with pytest.raises(SimulationError, match=f"objective.{key}"):
+    with pytest.raises(ProblemError, match=f"objective.{key}"):
         references(problem, dwell.draw(problem, seed=1, windows=2))
-    with pytest.raises(SimulationError, match=f"objective.{key}"):
+    with pytest.raises(ProblemError, match=f"objective.{key}"):
         dwell.search(problem)
 
 

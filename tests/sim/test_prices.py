@@ -161,7 +161,7 @@ def test_a_qos_without_a_price_has_no_cost_that_weighs_it() -> None:
 
 
 def test_references_and_judges_refuse_prices_that_they_cannot_know() -> None:
-    with pytest.raises(SimulationError, match=r"weights\.price"):
+    with pytest.raises(ProblemError, match=r"weights\.price"):
         references(cell(1.0), dwell.draw(cell(1.0), seed=1, windows=2))
     run = dwell.simulate(free(), seed=1, windows=2, policy="LOC")
     with pytest.raises(SimulationError, match="price_per_gb"):
