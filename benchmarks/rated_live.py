@@ -152,7 +152,9 @@ def _differences_ms(run: dwell.Run, commands: Sequence[Applied]) -> Iterator[flo
 
 def _figures(commands: Sequence[Applied], kills: Sequence[Kill], bound: int) -> Iterator[Figure]:
     steps = [(one, two, two.cycle - one.cycle - 1) for one, two in pairwise(commands)]
-    pictures = [one.picture for one in commands if one.picture >= 0]
+    # A new worker has no picture before its first.
+    seen = [one for one in commands if one.picture >= 0]
+    pictures = [one.picture for one in seen]
     ends_ns = [(kill.at_ns, kill.at_ns + 1_000_000_000) for kill in kills]
     other = [
         missing
@@ -176,7 +178,7 @@ def _figures(commands: Sequence[Applied], kills: Sequence[Kill], bound: int) -> 
         goal = Goal(high=bound) if whom.startswith("control") else None
         yield Figure(f"{whom} killed: missing in a row", missing, "", goal)
         ages = [
-            max(one.cycle - one.picture for one in commands if 0 <= one.at_ns - kill.at_ns < 3e9)
+            max(one.cycle - one.picture for one in seen if 0 <= one.at_ns - kill.at_ns < 3e9)
             for kill in mine
         ]
         yield Figure(f"{whom} killed: oldest picture, in cycles", ages, "")
