@@ -9,7 +9,7 @@ import json
 import os
 import struct
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,14 +176,31 @@ class Applied:
     at_ns: int
 
 
-class LightCell(Loopback):
-    """A cell of `document` on this machine; a context manager that waits until it runs."""
+def records(path: Path, record: struct.Struct) -> Iterator[tuple[Any, ...]]:
+    """Yield the whole records of a file that may not exist yet."""
+    data = path.read_bytes() if path.exists() else b""
+    return record.iter_unpack(data[: len(data) - len(data) % record.size])
 
-    def __init__(self, found: dict[str, Any], folder: Path, *, links: bool = False) -> None:
+
+class LightCell(Loopback):
+    """A cell of `document` on this machine; a context manager that waits until it runs.
+
+    Its processes find stages in the folders of `paths`; `observed` is what its actuator writes.
+    """
+
+    def __init__(
+        self,
+        found: dict[str, Any],
+        folder: Path,
+        *,
+        links: bool = False,
+        paths: Sequence[Path] = (),
+    ) -> None:
         problem = problem_of(found, folder, links=links)
-        self._observed = folder / "observed"
-        paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        environment = {OBSERVED: str(self._observed), "PYTHONPATH": os.pathsep.join(paths)}
+        self.observed = folder / "observed"
+        given = filter(None, [os.environ.get("PYTHONPATH")])
+        folders = [str(ROOT), *map(str, paths), *given]
+        environment = {OBSERVED: str(self.observed), "PYTHONPATH": os.pathsep.join(folders)}
         super().__init__(problem, folder, {}, environment=environment)
 
     def start(self) -> None:
@@ -196,13 +213,9 @@ class LightCell(Loopback):
             self.stop()
             raise
 
-    def applied(self) -> list[Applied]:
+    def applied(self) -> Sequence[Applied]:
         """Return the actuator's calls so far."""
-        if not self._observed.exists():
-            return []
-        data = self._observed.read_bytes()
-        whole = len(data) - len(data) % RECORD.size
-        return [Applied(*one) for one in RECORD.iter_unpack(data[:whole])]
+        return [Applied(*one) for one in records(self.observed, RECORD)]
 
     def pids(self) -> dict[str, int]:
         """Return the processes that the agents have started, by name."""

@@ -14,6 +14,7 @@ import struct
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import cycle, pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,7 @@ from typing import NamedTuple
 import dwell
 from benchmarks.figures import Figure, Goal, Section
 from benchmarks.live import everywhere
-from benchmarks.live_cell import OBSERVED, LightCell
+from benchmarks.live_cell import OBSERVED, Applied, LightCell, records
 from benchmarks.timing import ROOT
 from dwell.live.stage import Message
 from dwell.model.document import to_document
@@ -36,12 +37,10 @@ TURNS = ("control@R", "detect@E", "detect@R", "control@R", "imu@R", "camera@R", 
 RECORD = struct.Struct("<qqqq")
 
 
-class Applied(NamedTuple):
-    """A command at the actuator."""
+@dataclass(frozen=True, slots=True)
+class Command(Applied):
+    """A command at the actuator, and the cycle of the picture behind it."""
 
-    cycle: int
-    released_ns: int
-    at_ns: int
     picture: int
 
 
@@ -81,14 +80,11 @@ class RatedCell(LightCell):
         found["live"]["actuators"] = {"control": "benchmarks.rated_live:Actuator"}
         found["tasks"]["control"]["on"]["R"]["standby"] = 1
         found["scenarios"] = {}
-        super().__init__(found, folder, links=True)
-        self._path = folder / "observed"
+        super().__init__(found, folder, links=True, paths=[EXAMPLE.parent])
 
-    def commands(self) -> list[Applied]:
+    def applied(self) -> Sequence[Command]:
         """Return the commands so far."""
-        data = self._path.read_bytes() if self._path.exists() else b""
-        whole = len(data) - len(data) % RECORD.size
-        return [Applied(*one) for one in RECORD.iter_unpack(data[:whole])]
+        return [Command(*one) for one in records(self.observed, RECORD)]
 
     def kill(self, whom: str) -> None:
         """Kill a worker, or all workers of a task."""
@@ -100,14 +96,11 @@ class RatedCell(LightCell):
 def measure(quick: bool) -> Section:
     """See the module."""
     everywhere()
-    os.environ["PYTHONPATH"] = os.pathsep.join(
-        [str(EXAMPLE.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
-    )
     seconds = QUICK if quick else SECONDS
     with tempfile.TemporaryDirectory() as folder, RatedCell(Path(folder) / "cell") as cell:
         time.sleep(SETTLED_S)
         kills = _kill_in_turn(cell, seconds)
-        commands = cell.commands()
+        commands = cell.applied()
         cell.stop()
         run = next((Path(folder) / "cell" / "runs").iterdir())
         differences_ms = list(_differences_ms(dwell.open_run(run), commands))
@@ -137,7 +130,7 @@ def _kill_in_turn(cell: RatedCell, seconds: float) -> list[Kill]:
     raise AssertionError
 
 
-def _differences_ms(run: dwell.Run, commands: Sequence[Applied]) -> Iterator[float]:
+def _differences_ms(run: dwell.Run, commands: Sequence[Command]) -> Iterator[float]:
     """Yield the recorded L95 of the age less the one at the actuator, of windows without a gap."""
     by_number = {one.cycle: one for one in commands}
     numbers = dict(run.cycles.select("cycle", "number").iter_rows())
@@ -150,7 +143,7 @@ def _differences_ms(run: dwell.Run, commands: Sequence[Applied]) -> Iterator[flo
             yield recorded_ms - sorted(ages_ms)[math.ceil(0.95 * len(ages_ms)) - 1]
 
 
-def _figures(commands: Sequence[Applied], kills: Sequence[Kill], bound: int) -> Iterator[Figure]:
+def _figures(commands: Sequence[Command], kills: Sequence[Kill], bound: int) -> Iterator[Figure]:
     steps = [(one, two, two.cycle - one.cycle - 1) for one, two in pairwise(commands)]
     # A new worker has no picture before its first.
     seen = [one for one in commands if one.picture >= 0]

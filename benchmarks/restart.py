@@ -98,17 +98,9 @@ def _example(folder: Path) -> Iterator[LightCell]:
     found: dict[str, Any] = to_document(dwell.load(EXAMPLE))
     found["live"]["actuators"] = {"control": "benchmarks.live_cell:Actuator"}
     del found["live"]["hosts"]
-    before = os.environ.get("PYTHONPATH")
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(EXAMPLE.parent), before]))
-    try:
-        with LightCell(found, folder / "cell", links=True) as cell:
-            cell.client.ask("pin", HOME)
-            yield cell
-    finally:
-        if before is None:
-            del os.environ["PYTHONPATH"]
-        else:
-            os.environ["PYTHONPATH"] = before
+    with LightCell(found, folder / "cell", links=True, paths=[EXAMPLE.parent]) as cell:
+        cell.client.ask("pin", HOME)
+        yield cell
 
 
 @contextmanager
