@@ -1,6 +1,7 @@
 // The event loop: one call simulates up to the next decision, or to the end.
 #pragma once
 
+#include "metrics.h"
 #include "rules.h"
 
 namespace dwell {

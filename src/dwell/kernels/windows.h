@@ -71,8 +71,7 @@ template <class S>
 }
 
 // Place of a snapshot in `opened` and `closed`.
-template <class S>
-i64 snapshot_row(const S& s, i64 cell, i64 window) {
+inline i64 snapshot_row(const Tables& s, i64 cell, i64 window) {
   return (cell * s.clock[0].n_windows + window) * kParts * s.clock[0].n_resources;
 }
 
@@ -86,14 +85,12 @@ inline i64 opens(const Cell& cell, i64 cycle) {
 
 // Place of a snapshot in `look_opened` and `look_shares`: `part` 0 since the last decision, 1 over
 // the cycles that a decision looks at.
-template <class S>
-i64 look_row(const S& s, i64 cell, i64 look, i64 part) {
+inline i64 look_row(const Tables& s, i64 cell, i64 look, i64 part) {
   return ((cell * s.clock[0].n_looks + look) * 2 + part) * kParts * s.clock[0].n_resources;
 }
 
 // Place of a snapshot in `look_closed`.
-template <class S>
-i64 look_end_row(const S& s, i64 cell, i64 look) {
+inline i64 look_end_row(const Tables& s, i64 cell, i64 look) {
   return (cell * s.clock[0].n_looks + look) * kParts * s.clock[0].n_resources;
 }
 
