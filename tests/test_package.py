@@ -60,11 +60,12 @@ def test_the_source_distribution_has_the_kernel_s_sources_and_no_library(source:
     assert not list(source.rglob("*.so"))
 
 
-def test_the_wheel_is_small_and_has_the_kernel_and_its_sources(installed: Path) -> None:
+def test_the_wheel_is_small_and_has_the_kernel_without_its_sources(installed: Path) -> None:
     (wheel,) = installed.parent.glob("*.whl")
-    assert wheel.stat().st_size <= 1.55e6
-    # The sources are what the loader holds the library against.
-    load(installed / "dwell" / "kernels")
+    assert wheel.stat().st_size <= 1.48e6
+    kernels = installed / "dwell" / "kernels"
+    assert not [*kernels.glob("*.cpp"), *kernels.glob("*.h"), *kernels.glob("*.txt")]
+    load(kernels)
 
 
 def test_the_wheel_has_the_examples_and_nothing_else(installed: Path) -> None:

@@ -86,6 +86,12 @@ def test_a_library_of_other_sources_is_refused(name: str, folder: Path) -> None:
     assert refusal(folder).startswith("was built of other sources than those beside it; ")
 
 
+def test_a_wheel_has_no_sources(folder: Path) -> None:
+    for source in (*folder.glob("*.cpp"), *folder.glob("*.h"), *folder.glob("*.txt")):
+        source.unlink()
+    assert load(folder).dwell_digest is not None
+
+
 def test_a_library_of_a_source_that_is_gone_is_refused(checkout: Path) -> None:
     (checkout / "export.h").unlink()
     mends = f"rm {checkout / NAME} && make env"

@@ -1,4 +1,4 @@
-"""Loading of the compiled kernel, a library of C functions in the folder of its sources.
+"""Loading of the compiled kernel, a library of C functions.
 
 Calls release Python's global lock (`ctypes.CDLL`). Two threads may call at the same time, because
 the library has no global state. The build hook (`hatch_build.py`) makes the file.
@@ -16,7 +16,7 @@ from importlib.resources.abc import Traversable
 from typing import Any, Final
 
 from dwell.errors import DISTRIBUTION, KernelError
-from dwell.kernels.library_file import NAME, is_of, read_header, source_digest
+from dwell.kernels.library_file import FLAGS, NAME, is_of, read_header, source_digest
 
 #: Command that builds the library in a checkout.
 BUILD: Final = "apt-get install g++ && make env"
@@ -26,9 +26,10 @@ INSTALL_AGAIN: Final = f"pip install --force-reinstall {DISTRIBUTION}"
 
 @cache
 def library() -> ctypes.CDLL:
-    """Return the library built from the sources in this package.
+    """Return the library of this package.
 
-    Raises KernelError if it is missing, damaged, from other sources or for another processor.
+    Raises KernelError if it is missing, damaged, for another processor, or from other sources than
+    those beside it.
     """
     return load(files(__package__))
 
@@ -60,7 +61,7 @@ def compiler() -> str:
 
 
 def load(folder: Traversable) -> ctypes.CDLL:
-    """Check the library in a folder against the sources there, and open it.
+    """Check the library in a folder against the sources there, if any, and open it.
 
     The check precedes the mapping into memory, because access to a missing part of a mapped file
     ends the process.
@@ -69,7 +70,7 @@ def load(folder: Traversable) -> ctypes.CDLL:
     remedy = f"rm {shlex.quote(str(file))} && make env"
     try:
         content = file.read_bytes()
-        flaw = _flaw(content, source_digest(folder))
+        flaw = _flaw(content, folder)
         if not flaw:
             return ctypes.CDLL(str(file))
     except FileNotFoundError:
@@ -81,8 +82,8 @@ def load(folder: Traversable) -> ctypes.CDLL:
     raise KernelError(f"the compiled kernel {file} {flaw}", remedy)
 
 
-def _flaw(content: bytes, digest: str) -> str:
-    """Return the fault of a library as text; empty if it is valid."""
+def _flaw(content: bytes, folder: Traversable) -> str:
+    """Return the fault of a library in a folder as text; empty if it is valid."""
     header, machine = read_header(content), platform.machine()
     if header is None:
         return "is no library"
@@ -90,6 +91,7 @@ def _flaw(content: bytes, digest: str) -> str:
         return f"is for {header.machine}, this computer is {machine}"
     if len(content) < header.n_bytes:
         return f"is cut short: {len(content)} of {header.n_bytes} bytes"
-    if not is_of(content, digest):
+    # A wheel has no sources.
+    if folder.joinpath(FLAGS).is_file() and not is_of(content, source_digest(folder)):
         return "was built of other sources than those beside it"
     return ""
