@@ -124,6 +124,31 @@ def test_a_chain_takes_the_place_of_the_latency_in_what_the_controller_sees() ->
     assert plain["seen_l95_ms"].max() < 10
 
 
+def test_the_mean_age_of_a_chain_counts_commands_of_cycles_that_waited_for_long() -> None:
+    # A command every 15 ms in cycles of 10 ms: cycles wait, up to D, and take ever newer pictures.
+    on = {name: {"R": Execution(Constant(ms))} for name, ms in (("camera", 1), ("act", 15))}
+    problem = make_problem(
+        [Node("R", "robot", 4)],
+        [Task("camera", on["camera"]), Task("act", on["act"], every=1)],
+        [Flow("camera", "act", sampled=True)],
+        period_ms=10,
+        deadline_ms=640,
+        window_cycles=20,
+    )
+    chains = {"see-act": Chain("camera", "act", 20)}
+    problem = replace(problem, pipeline=replace(problem.pipeline, chains=chains))
+    objective = replace(
+        problem.objective,
+        weights=Weights(age=1.0),
+        targets=Targets(latency_ms=20, age_ms=20.0),
+        latency="see-act",
+    )
+    run = dwell.simulate(replace(problem, objective=objective), seed=1, windows=10, policy="LOC")
+    assert run.cycles["latency_ns"][100] > 4 * 20e6
+    # At a command its picture is 20 or 25 ms old, in turn; then it ages for 15 ms.
+    assert run.windows["seen_age_ms"][1:6].to_list() == pytest.approx([30.0] * 5, abs=0.5)
+
+
 def test_a_policy_leaves_a_placement_whose_data_are_old() -> None:
     # Without a bound on the age and the chain in J, the policy sees latencies alone.
     problem = chained(None)

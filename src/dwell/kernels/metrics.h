@@ -56,8 +56,10 @@ template <class S>
   f64 area = 0.0;
   i64 until_ns = now, cycle = of.released - 1;
   for (; cycle >= 0 && until_ns > begin_ns; --cycle) {
-    // All older commands count with the largest age.
-    if (static_cast<f64>(begin_ns - of.release_ns[cycle]) >= most_ns) break;
+    // A cycle whose place another has taken had ended by then. All older commands, too, count with
+    // the largest age. Until its end a cycle may take a value that is newer than itself.
+    const i64 ended = of_chain ? cycle + s.n_slots : cycle;
+    if (ended < of.released && static_cast<f64>(begin_ns - of.release_ns[ended]) >= most_ns) break;
     const i64 row = of_chain ? s.actuation(cell, of.latency_chain, cycle) : s.output(cell, cycle);
     const i64 at_ns =
         of_chain ? s.actuated_ns[row] : later(of.release_ns[cycle], s.latency_ns[row]);
