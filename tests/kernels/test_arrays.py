@@ -53,6 +53,14 @@ def test_a_ring_that_has_to_grow_changes_nothing(
     assert_equal(found, expected)
 
 
+def test_the_ring_needs_no_more_places_than_cycles() -> None:
+    problem = dwell.load(CELL.with_name("inner-loop.yaml"))
+    late = replace(problem, controller=replace(problem.controller, order_delay_ms=1e5))
+    real = dwell.draw(late, scenario="baseline", seed=1, windows=3)
+    slots = lay_out([(late, real)], log_windows=True).tables.clock["n_slots"][0]
+    assert real.cycles <= slots < 2 * real.cycles
+
+
 def test_two_threads_may_play_one_realisation(canonical: Problem) -> None:
     expected = played(canonical, windows=40)
     real = dwell.draw(canonical, scenario="edge-cpu-stress", seed=3, windows=40)

@@ -937,7 +937,8 @@ class _Layout:
                 if (close_ns > real.release_ns[1:]).any():
                     released = np.searchsorted(real.release_ns[:-1], close_ns)
                     after = int((released - np.arange(1, real.cycles + 1)).max())
-                held = max(held, problem.earlier_cycles + problem.window_cycles + after)
+                needed = problem.earlier_cycles + problem.window_cycles + after
+                held = max(held, min(needed, real.cycles))
         return 1 << (held - 1).bit_length()
 
     def _announce_first(self, changes: Rows) -> None:
