@@ -86,9 +86,12 @@ def test_an_actuator_that_raises_is_told_and_moves_nothing(cell: RealCell) -> No
     status = cell.status()
     assert status["health"] == "degraded"
     assert "apply() raised RuntimeError: told to fail" in status["headline"]
-    calls = [seen.what for seen in cell.actuations.since(begin_ns)]
-    assert calls.count(APPLY) > 3
-    wait_until(lambda: HOLD in [seen.what for seen in cell.actuations.since(begin_ns)])
+
+    def calls() -> list[int]:
+        return [seen.what for seen in cell.actuations.since(begin_ns)]
+
+    wait_until(lambda: calls().count(APPLY) > 3)
+    wait_until(lambda: HOLD in calls())
     cell.end(refuses)
     cell.wait_for("the whole cell at home", cell.at_home, 30.0)
     wait_until(lambda: cell.status().get("health") == "ok")
