@@ -11,6 +11,7 @@ import gc
 import os
 import signal
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from itertools import chain, permutations
 from pathlib import Path
@@ -128,6 +129,20 @@ APART = (
     "tests/live/wire/test_continuity.py",
     "tests/regression/test_runs.py",
 )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let real processes that keep a period have the CPU before the tests side by side.
+
+    Their shadow jobs run in the lowest scheduling class, and need what the cell leaves: next to
+    busy processes of the same session they starve, at any niceness, and a cell that has left its
+    placement never proves that it may return. A kernel that shares the CPU by session (autogroup)
+    gives each session its share, by its niceness.
+    """
+    if hasattr(config, "workerinput"):
+        with suppress(OSError):
+            os.setsid()
+            Path("/proc/self/autogroup").write_text("10")
 
 
 def pytest_xdist_auto_num_workers() -> int:
