@@ -81,9 +81,7 @@ class RealCell(Harness):
         if len(self.runs) != 1:
             return [f"{len(self.runs)} runs instead of one"]
         run = dwell.open_run(self.runs[0])
-        ordered = run.decisions.filter(
-            run.decisions["migrated"] & (run.decisions["reason"] != "guard")
-        )
+        ordered = run.decisions.filter(run.decisions["migrated"] & (run.decisions["cycles"] > 0))
         told = run.cycles.filter(run.cycles["actuated"].cast(bool, strict=False))
         self.actuations.look()
         return wrong_record(

@@ -664,11 +664,11 @@ def _wrong_record(world: FaultyWorld) -> list[str]:
     """Return what is wrong with the record of the run."""
     rows = columns(world, "cycles", "run", "number", "actuated")
     cycles = [(number, actuated) for run, number, actuated in rows if run == world.judge.run]
-    decisions = columns(world, "decisions", "last_cycle", "migrated", "reason")
+    decisions = columns(world, "decisions", "last_cycle", "migrated", "cycles")
     return wrong_record(
         [number for number, _ in cycles],
         [window for (window,) in columns(world, "windows", "window")],
-        [last for last, migrated, reason in decisions if migrated and reason != "guard"],
+        [last for last, migrated, cycles in decisions if migrated and cycles],
         world.problem.stay_cycles,
         [number for number, actuated in cycles if actuated],
         {one.cycle for one in world.seen if one.what == APPLY},

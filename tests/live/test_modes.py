@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
+import dwell
+from dwell.dash.recorded_cell import RecordedCell
 from dwell.live.wire import channels
 from dwell.live.wire.messages import Ask, encode
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
 from dwell.model import Problem
-from tests.live.small_world import EXEC_MS, World, canonical
+from dwell.record import moves
+from dwell.report.run_page import run_page
+from tests.live.small_world import EXEC_MS, Recorded, World, canonical
+from tests.report.pages import table_of
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +72,43 @@ def test_a_pin_holds_against_the_policy_even_where_it_only_advises(problem: Prob
     assert world.stamper.placement == "HYB"
     assert world.status["pinned"] == "HYB"
     require_unbroken(world.cycles, world)
+
+
+@pytest.mark.parametrize("every", [5, 20])
+def test_moves_of_an_operator_are_rows_of_decisions(
+    problem: Problem, tmp_path: Path, every: int
+) -> None:
+    decides = replace(problem.controller, decide_cycles=every, min_dwell_cycles=0)
+    frequent = replace(problem, window_cycles=20, warmup_windows=0, controller=decides)
+    world = Recorded(frequent, tmp_path, policy="SO")
+    for what, about in (("pin", "HYB"), ("pin", "LOC"), ("unpin", ""), ("drain", "E")):
+        world.run(2_500)
+        assert not ask(world, what, about)
+    world.run(2_500)
+    folder = world.finish()
+    run = dwell.open_run(folder)
+    found = moves(run)
+    assert [(move.source, move.target, move.reason) for move in found] == [
+        ("SO", "HYB", "pinned"),
+        ("HYB", "LOC", "pinned"),
+        ("LOC", "SO", "migrate"),
+        ("SO", "LOC", "drained"),
+    ]
+    assert [move.is_decided for move in found] == [False, False, True, False]
+    placed, firsts = run.cycles["placement"].cast(str).to_list(), run.windows["first_cycle"]
+    for move in found:
+        if not move.is_decided:
+            assert placed[move.cycle - 1 : move.cycle + 1] == [move.source, move.target]
+            assert firsts[move.window] < move.cycle <= firsts[move.window + 1] + 20
+            assert run.decisions["dwell"][move.row] == 0
+    # The pages have the moves, too.
+    rows = table_of(run_page(run), "migrations").rows
+    assert [row["reason"] for row in rows] == ["pinned", "pinned", "migrate", "drained"]
+    shown = RecordedCell(folder)
+    assert shown.described()["about"]["policy"] == "Static"
+    assert shown.described()["moves"] == {"migrations": 4, "returns": 1, "guard_moves": 0}
+    texts = [event["text"] for event in shown.view(0.0, 20.0, 100)["events"]]
+    assert {"SO → HYB: pinned", "HYB → LOC: pinned", "SO → LOC: drained"} <= {*texts}
 
 
 def test_code_is_changed_by_draining_at_no_cycle_lost(problem: Problem) -> None:

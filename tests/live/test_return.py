@@ -222,7 +222,8 @@ def test_the_record_has_no_move_that_was_none() -> None:
     names = list(columns_of(world.cell.controller)["decisions"])
     rows = [dict(zip(names, row, strict=True)) for row in world.recorder.rows["decisions"]]
     # The policy has wanted to stay all the time, and nothing of that was held back.
-    assert [row["placement"] for row in rows if row["migrated"]] == ["LOC"]
+    moved = [(row["placement"], row["reason"]) for row in rows if row["migrated"]]
+    assert moved == [("LOC", "guard"), ("SO", "pinned")]
     assert {row["refused"] for row in rows} <= {None}
 
 

@@ -30,7 +30,7 @@ from dwell.estimators import by_name as estimator_by_name
 from dwell.estimators.protocol import CellEstimator
 from dwell.estimators.registry import resolved
 from dwell.estimators.user_estimator import as_started
-from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS
+from dwell.model import Caps, Decision, FrozenDict, Objective, Problem, QoS, Reason
 from dwell.model.bounds import CLASS_PATH
 from dwell.model.controller_settings import SHADOW_FRACTION
 from dwell.model.number_arrays import Floats, Ints
@@ -641,12 +641,9 @@ class Controller:
         self.course.fall(name, left)
         if self.coordination is not None:
             self.coordination.place(name)
-        window, *cycles = self.looked
-        fixed = (window, left, name, name != left, "guard", 0, None, *cycles, 0)
-        priced = [None] * (len(self.decision_columns) - len(fixed))
-        self.decisions.append((*fixed, *priced, None))
+        self._record_move(left, name, "guard")
 
-    def resume(self, name: str, *, fallback: bool = False) -> None:
+    def resume(self, name: str, *, fallback: bool = False, moved_by: Reason | None = None) -> None:
         """Record the placement of the cell after a move that this controller did not decide.
 
         A person has moved the cell, or this controller takes over from another. n_d becomes 0,
@@ -658,11 +655,23 @@ class Controller:
             Candidate.
         fallback : bool
             Whether the guard has made the move.
+        moved_by : {"pinned", "drained", "ordered"}, optional
+            Reason of a move that ``decisions`` gets a row of; None for a takeover.
         """
-        self._find(name, self.course.placement)
+        left = self.course.placement
+        self._find(name, left)
         self.course.find(name, by_guard=fallback)
         if self.coordination is not None:
             self.coordination.place(name)
+        if moved_by is not None:
+            self._record_move(left, name, moved_by)
+
+    def _record_move(self, left: str, name: str, reason: Reason) -> None:
+        """Append a row to ``decisions`` for a move that no proposal made."""
+        window, *cycles = self.looked
+        fixed = (window, left, name, name != left, reason, 0, None, *cycles, 0)
+        priced = [None] * (len(self.decision_columns) - len(fixed))
+        self.decisions.append((*fixed, *priced, None))
 
     def _find(self, name: str, believed: str) -> None:
         """Report the placement of the cell to a policy that assumes another placement."""

@@ -122,7 +122,7 @@ def policy_of(run: Run, placed: NDArray[np.int32]) -> str | None:
     if policy is None:
         return None
     name = str(policy).partition("(")[0].strip()
-    if name == STATIC and len(placed):
+    if name == STATIC and len(placed) and (placed == placed[0]).all():
         return f"{list(run.problem.candidates)[placed[0]]}, without moves"
     return name
 

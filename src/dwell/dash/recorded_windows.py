@@ -93,7 +93,7 @@ class RecordedWindows:
         self._incumbent = placement_codes(table.names("incumbent"), self._candidates)
         refused = run.decisions["refused"].to_list() if "refused" in table else []
         self._refused = [text or "" for text in refused] or [""] * len(self._reasons)
-        at_close = ~by_guard(table)
+        at_close = ~by_guard(table) & (table["cycles"] > 0)
         # Row of each window's decision; -1 without a decision.
         self._row = np.full(len(self.number), -1)
         # Index of each decision's window; decisions of missing windows get -1.

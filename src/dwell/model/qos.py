@@ -11,7 +11,10 @@ from dwell.errors import MetricError
 from dwell.model.frozen import FrozenDict
 from dwell.model.placement import Placement
 
-Reason: TypeAlias = Literal["dwell", "hold", "migrate", "capped", "infeasible", "guard"]
+#: The last three are reasons of moves that an operator or another controller ordered.
+Reason: TypeAlias = Literal[
+    "dwell", "hold", "migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered"
+]
 #: Every reason of a decision.
 REASONS: tuple[Reason, ...] = get_args(Reason)
 INFINITY = math.inf

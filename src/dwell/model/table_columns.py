@@ -96,7 +96,7 @@ LOST = "no sink completed the cycle"
 UNCOMPARED = "the clocks were not compared"
 APART = f"{LOST}, or {UNCOMPARED}"
 UNSEEN = "the controller did not see the close"
-GUARD = "a move of the guard's own"
+GUARD = "a move of the guard or of an operator"
 UNMEASURED = "an accelerator of a live cell that was not measured"
 UNTOLD = "not counted"
 LIVE: tuple[Feature, ...] = ("live",)
@@ -266,7 +266,9 @@ DECISIONS = (
         null="the policy computes none",
     ),
     Column("last_cycle", "Int64", "The last cycle that it looked at."),
-    Column("cycles", "Int64", "How many cycles it looked at; 0: a move of the guard's."),
+    Column(
+        "cycles", "Int64", "How many cycles it looked at; 0: a move of the guard or of an operator."
+    ),
     Column("dwell_cycles", "Int64", "n_d in cycles."),
     Column("seen_l95_ms", "Float64", "L95 of the cycles that it looked at.", "ms", GUARD, BETWEEN),
     Column("seen_violation_rate", "Float64", "V_D of these cycles.", null=GUARD, of=BETWEEN),

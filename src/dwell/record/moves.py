@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
 #: Reason of a move that the robot made by itself.
 GUARD = "guard"
+#: Reasons of moves that no decision on cycles made: the robot's, and those of operators.
+UNDECIDED = (GUARD, "pinned", "drained", "ordered")
 
 
 class _Columns(Protocol):
@@ -50,6 +52,11 @@ class Move(NamedTuple):
         """Whether the robot moved by itself."""
         return self.reason == GUARD
 
+    @property
+    def is_decided(self) -> bool:
+        """Whether a decision on cycles made it."""
+        return self.reason not in UNDECIDED
+
 
 def moves(run: Run | FleetRun) -> list[Move]:
     """Return the moves of a run, or of all cells of a fleet, in the order of the decisions."""
@@ -65,8 +72,8 @@ def moves_in(decisions: _Columns) -> list[Move]:
 
 
 def _move(row: int, window: int, last: int, source: str, target: str, reason: str) -> Move:
-    # A move of the guard is recorded under the window that follows it.
-    return Move(row, window - (reason == GUARD), last + 1, source, target, reason)
+    # A move without a decision is recorded under the window that follows it.
+    return Move(row, window - (reason in UNDECIDED), last + 1, source, target, reason)
 
 
 def by_guard(decisions: TableArrays) -> Mask:

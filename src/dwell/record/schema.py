@@ -41,6 +41,9 @@ REASON_SENTENCES: Mapping[Reason, str] = {
     "capped": "the cheapest placement within the caps; a cheaper one was over a cap",
     "infeasible": "all candidates are over a cap, this one least",
     "guard": "the robot moved by itself",
+    "pinned": "an operator pinned the cell to this placement",
+    "drained": "an operator drained a node of the placement before",
+    "ordered": "another controller, or an order without an answer, moved the cell",
 }
 
 

@@ -433,7 +433,8 @@ class _RunPage:
         length_s = self.header.problem.window_ms / 1e3
         rows = []
         for move in found[:MOST_ROWS]:
-            known, later_s = (move.window + 1, 0.0) if move.by_guard else (move.window, length_s)
+            decided = move.is_decided
+            known, later_s = (move.window, length_s) if decided else (move.window + 1, 0.0)
             rows.append(
                 {
                     "window": move.window,

@@ -10,7 +10,7 @@ import numpy as np
 
 from dwell.model.objective import AIM
 from dwell.record import shown_reason
-from dwell.record.moves import GUARD
+from dwell.record.moves import UNDECIDED
 from dwell.report.charts import (
     coloured,
     disc,
@@ -359,7 +359,7 @@ def _estimates(timed: pl.DataFrame, candidates: Sequence[str], each: int) -> pl.
     """Return the estimates of J of inactive candidates; the median for several windows."""
     import polars as pl
 
-    priced = timed.filter(pl.col("reason").cast(pl.String) != GUARD)
+    priced = timed.filter(~pl.col("reason").cast(pl.String).is_in(UNDECIDED))
     parts = [
         priced.select(
             "time",

@@ -65,7 +65,7 @@ def _rows(run: Run, excluded: Collection[int]) -> Iterator[tuple[object, ...]]:
     found, decisions = moves(run), run.decisions
     for move, following in itertools.zip_longest(found, found[1:]):
         window, target = move.window, move.target
-        if move.by_guard or window in passed:
+        if not move.is_decided or window in passed:
             continue
         until = math.inf if following is None else following.window
         estimates = (f"est_{what}_{target}" for what in QUANTITIES)

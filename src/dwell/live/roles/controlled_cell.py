@@ -36,6 +36,7 @@ from dwell.live.wire.messages import (
 )
 from dwell.live.wire.transport import Arrival
 from dwell.live.wire.wiring import roles
+from dwell.model import REASONS, Reason
 from dwell.model.placement import nodes_of
 
 #: Time between two status requests to the stamper, and between two copies of an unanswered order.
@@ -48,7 +49,7 @@ CONFIRMATIONS = 3
 TRANSFER_SHARE = 2
 
 #: Reasons of moves: the policy's, the guard, an operator's (pinned, drained), an unknown order.
-MOVED_BY = ("migrate", "capped", "infeasible", "guard", "pinned", "drained", "ordered")
+MOVED_BY = tuple(reason for reason in REASONS if reason not in ("dwell", "hold"))
 
 Phase: TypeAlias = Literal["fork", "state", "order"]
 
@@ -79,7 +80,7 @@ class _Move:
     """
 
     name: str
-    reason: str
+    reason: Reason
     since_ns: int
     phase: Phase
     forks: tuple[tuple[str, str], ...] = ()
@@ -301,19 +302,19 @@ class ControlledCell:
         self._unconfirmed = self._told = None
         self._term_asked = self.order_number
         self.refused = ""
+        reason: Reason = "guard" if by_guard else "ordered"
         if move is not None and move.name == placement and not by_guard:
-            self._move, self._unwritten = None, True
-            self.moves[move.reason] += 1
+            self._move, self._unwritten, reason = None, True, move.reason
             if move.proposal is not None:
                 controller.commit(move.proposal)
         else:
             self._stay(f"the placement became {placement} meanwhile")
-            self.moves["guard" if by_guard else "ordered"] += 1
             if by_guard and move is not None:
                 # The placement may be the migration's target, but the states were not sent.
                 self.refused = (
                     f"the guard moved the cell to {placement} before the move to {move.name}"
                 )
+        self.moves[reason] += 1
         if by_guard:
             if self.windows is not None:
                 controller.looked = self.windows.fell(run, term)
@@ -321,7 +322,9 @@ class ControlledCell:
         else:
             if placement != course.placement:
                 # An operator's choice, not the policy's.
-                controller.resume(placement)
+                if self.windows is not None:
+                    controller.looked = self.windows.before(run, term)
+                controller.resume(placement, moved_by=reason)
             course.credit(by_guard=False)
         course.enter(run, term)
 
@@ -475,7 +478,7 @@ class ControlledCell:
             if task.state_bytes and node not in nodes_of(old[task.name])
         )
         phase: Phase = "fork" if forks else "order"
-        wish = "pinned" if self.pinned else "drained"
+        wish: Reason = "pinned" if self.pinned else "drained"
         reason = wish if proposal is None else proposal.decision.reason
         patience_ns = PATIENCE_NS + self._transfer_ns(forks)
         self._move = _Move(

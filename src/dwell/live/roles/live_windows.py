@@ -212,14 +212,15 @@ class LiveWindows:
         self._begin_again()
 
     def fell(self, run: int, term: int) -> LookedAt:
-        """Begin the next window with a move of the guard, which began a term of a run.
-
-        Return the window and the last cycle before the move, as numbers in the record.
-        """
+        """Begin the next window with a move of the guard, which began a term; see `before`."""
         self._fell = run, term
         self._begin_again()
-        count = sum((one.run, one.term) < self._fell for one in self._line[self._window.at :])
-        count *= self.often
+        return self.before(run, term)
+
+    def before(self, run: int, term: int) -> LookedAt:
+        """Return the window that follows a move, and the last cycle before it, in the record."""
+        line = self._line[self._window.at :]
+        count = sum((one.run, one.term) < (run, term) for one in line)
         return LookedAt(self._next_window, self.record.next_row + count - 1, 0)
 
     def forget(self, run: int, cycle: int) -> None:
