@@ -70,6 +70,15 @@ def test_an_objective_that_a_search_does_not_support_is_a_fault_of_the_file(
     assert_refused(refused, f"{cell}: objective.{key}: the search of placements does not support")
 
 
+def test_too_few_cycles_for_a_run_of_each_sink_are_refused(cell: Path) -> None:
+    cell.write_text(
+        SMALL.replace("plan: {on", "plan: {every: 2, on").replace("plan}", "plan, sampled: true}"),
+        encoding="utf-8",
+    )
+    refused = call("candidates", cell, "--cycles", "1")
+    assert_refused(refused, "error: --cycles: 1 is not allowed; it must be at least 2, the cycles")
+
+
 @pytest.mark.parametrize("option", ["--scenario", "--scenarios"])
 def test_an_unknown_scenario_is_refused(cell: Path, option: str) -> None:
     assert_refused(call("candidates", cell, option, "rain"), "unknown scenario 'rain'")

@@ -121,6 +121,50 @@ def test_an_objective_that_references_do_not_support_is_a_fault_of_the_file(
     assert not Path("studies").exists()
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "refused"),
+    [
+        (
+            "--windows",
+            "5",
+            "error: --windows: 5 is not allowed; it must be more than the 5 windows",
+        ),
+        ("--seconds", "1", "error: --seconds 1: 5 is not allowed; it must be more than the 5"),
+    ],
+)
+def test_runs_within_the_warm_up_are_refused(
+    cell: Path, study: Path, option: str, value: str, refused: str
+) -> None:
+    cell.write_text(f"{SMALL}warmup_windows: 5\n", encoding="utf-8")
+    assert_refused(call("study", study, option, value), refused)
+
+
+@pytest.mark.parametrize(
+    ("own", "policy", "refused"),
+    [
+        ("latency: reaction", "latency: other", "'other' is not allowed; it must be reaction, as"),
+        ("caps: {latency_ms: 9}", "latency: reaction", "'reaction' is not allowed; it must be abs"),
+        (
+            "weights: {age: 1}, targets: {age_ms: 50}",
+            "weights.age: 0",
+            "weights.age: 0.0 is not allowed; it must be above 0, as in the cell",
+        ),
+    ],
+)
+def test_policies_whose_runs_the_cell_cannot_judge_are_a_fault_of_the_file(
+    cell: Path, study: Path, own: str, policy: str, refused: str
+) -> None:
+    chain = "{from: sense, to: plan}"
+    chains = f"chains: {{reaction: {chain}, other: {chain}}}\n"
+    cell.write_text(f"{SMALL}{chains}objective: {{{own}}}\n", encoding="utf-8")
+    policies = f"policies: {{LOC: LOC, mine: {{policy: dtp, objective.{policy}}}}}"
+    text = STUDY.replace("references: true\n", "").replace("policies: [LOC, dtp]", policies)
+    study.write_text(text, encoding="utf-8")
+    found = call("study", study)
+    assert_refused(found, f"{study}:6: policies.mine.objective.")
+    assert refused in found.stderr
+
+
 def test_references_do_not_support_idle_cycles(cell: Path, study: Path) -> None:
     cell.write_text(
         SMALL.replace("plan: {on", "plan: {every: 2, on").replace("plan}", "plan, sampled: true}"),

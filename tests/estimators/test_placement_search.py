@@ -238,7 +238,7 @@ def test_a_search_needs_a_run_of_each_sink() -> None:
     cell["tasks"]["control"]["every"] = 10
     problem = from_document(cell)
     assert dwell.search(problem, cycles=10)
-    with pytest.raises(SimulationError, match="cycles is 9; it must be at least 10"):
+    with pytest.raises(ProblemError, match="cycles: 9 is not allowed; it must be at least 10"):
         dwell.search(problem, cycles=9)
 
 

@@ -156,7 +156,7 @@ def test_progress_counts_runs() -> None:
         ({"seeds": ()}, SimulationError, "seeds is empty"),
         ({"seeds": (1, 2, 1)}, SimulationError, "seeds holds 1 twice"),
         ({"policies": ("LOC", "LOC")}, SimulationError, "policies holds 'LOC' twice"),
-        ({"windows": 2}, SimulationError, "more than the 2 windows of warm-up"),
+        ({"windows": 2}, ProblemError, "more than the 2 windows of warm-up"),
         ({"scenarios": ("rain",)}, ProblemError, "unknown scenario 'rain'"),
         ({"policies": ("dpt",)}, PolicyError, "unknown policy 'dpt'"),
         (

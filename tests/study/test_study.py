@@ -62,7 +62,7 @@ def grid(*, dwells: range, delays: range) -> tuple[Point, ...]:
         ({"contenders": ()}, SimulationError, "policies is empty"),
         ({"contenders": (Contender("a", "LOC"),) * 2}, SimulationError, "holds 'a' twice"),
         ({"seeds": (1, 2, 1)}, SimulationError, "seeds holds 1 twice"),
-        ({"windows": 2}, SimulationError, "more than the 2 windows of warm-up"),
+        ({"windows": 2}, ProblemError, "more than the 2 windows of warm-up"),
         ({"windows": 2**32}, ProblemError, "windows of window_cycles = .* 4294967295"),
         (
             {"contenders": (Contender("clairvoyant", "LOC"),), "references": True},

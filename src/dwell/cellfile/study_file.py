@@ -188,11 +188,8 @@ class _Reading:
             self.faults.add(path, message)
 
     def _check_windows(self, windows: int, cells: Sequence[Problem]) -> None:
-        warmup = max((cell.warmup_windows for cell in cells), default=0)
-        if windows <= warmup:
-            bound = f"more than the {warmup} windows of warm-up"
-            self.faults.add("windows", f"{windows} is not allowed; it must be {bound}")
         for cell in cells:
+            self.faults.attempt("", cell.require_counted, windows)
             self.faults.attempt("", cell.cycles_of, windows)
 
     # ------------------------------------------------------------------------------ cell
@@ -421,8 +418,13 @@ class _Reading:
             if policy.estimator is not None and is_estimator(policy.estimator):
                 place = f"{path}.estimator"
                 overrides.append(Override(place, ("controller", "estimator"), policy.estimator))
-            if overrides:
-                cell.attempt(overrides, self.faults, path)
+            changed = cell.attempt(overrides, self.faults, path) if overrides else None
+            if changed is not None:
+                self._check_judged(path, cell.problem, changed.problem)
+
+    def _check_judged(self, path: str, cell: Problem, changed: Problem) -> None:
+        """Check that the cell's objective can judge the runs of a policy with other settings."""
+        self.faults.attempt(path, cell.objective.require_judgeable, changed.objective)
 
 
 #: Parameters of a study of a fleet: functions that apply a value.
@@ -459,7 +461,9 @@ class _FleetReading(_Reading):
         for policy in policies:
             for entry in fleet.entries if policy.settings else ():
                 place = f"policies.{policy.name}"
-                self.faults.attempt(place, with_settings, entry.cell, policy.settings)
+                changed = self.faults.attempt(place, with_settings, entry.cell, policy.settings)
+                if changed is not None:
+                    self._check_judged(place, entry.cell, changed)
         points = tuple(DeclaredPoint(values, first.cell, one) for values, one in fleets)
         return _Plays(points, scenarios, policies, cells)
 

@@ -47,7 +47,7 @@ def candidates(
     The search simulates each placement that a lower bound of J does not exclude, on common samples.
     A scenario with disturbances is simulated for 300 windows.
     """
-    from dwell.estimators.placement_search import rank, rank_until_apart
+    from dwell.estimators.placement_search import rank, rank_until_apart, require_runs
 
     problem = dwell.load(cell, traces=traces)
     try:
@@ -58,6 +58,7 @@ def candidates(
     if cycles is None:
         ranking = rank_until_apart(problem, names, seed=seed, top=top)
     else:
+        require_runs(problem, cycles, "--cycles")
         ranking = rank(problem, names, cycles=cycles, seed=seed, top=top)
     called = dict(_named(problem, ranking.best))
     if as_json:

@@ -17,8 +17,7 @@ from dwell.cli.options import (
     Windows,
     option,
     require_few,
-    require_one_length,
-    windows_of,
+    windows_of_study,
 )
 from dwell.cli.output import mark_of, print_json, progress, require_own, working, write_file
 
@@ -53,14 +52,12 @@ def demo(
     from dwell.report import comparison_html, comparison_text
     from dwell.study import compare_study, load_study
 
-    require_one_length(windows, seconds)
     folder = find_examples(examples)
     plan = replace(load_study(folder / STUDY), seeds=tuple(range(1, seeds + 1)))
     cells = [plan.points[0].problem]
     if real is not None:
         cells = [dwell.load(folder / name, traces=real) for name in REAL]
-    if seconds is not None:
-        windows = windows_of(seconds, *cells)
+    windows = windows_of_study(windows, seconds, *cells)
     plans = [_on(plan, cell, windows or plan.windows) for cell in cells]
     page = out / "report.html"
     mark = mark_of(str(folder.resolve()), str(real), seeds, windows or plan.windows)

@@ -142,6 +142,26 @@ def require_one_length(windows: int | None, seconds: float | None) -> None:
         raise typer.BadParameter("--windows and --seconds: give one of them")
 
 
+def windows_of_study(windows: int | None, seconds: float | None, *problems: Problem) -> int | None:
+    """Return the length of a study's runs in windows; None if neither length is given.
+
+    Raises
+    ------
+    typer.BadParameter
+        If both are given, or the problems' windows differ in length.
+    ProblemError
+        If the runs are too long, or not longer than the warm-up.
+    """
+    require_one_length(windows, seconds)
+    path = "--windows"
+    if seconds is not None:
+        path, windows = f"--seconds {seconds:g}", windows_of(seconds, *problems)
+    if windows is not None:
+        for problem in problems:
+            problem.require_counted(windows, path)
+    return windows
+
+
 def windows_of(seconds: float, *problems: Problem) -> int:
     """Return the smallest number of windows, at least 1, that lasts `seconds`.
 

@@ -20,8 +20,7 @@ from dwell.cli.options import (
     flag,
     option,
     require_few,
-    require_one_length,
-    windows_of,
+    windows_of_study,
 )
 from dwell.cli.output import file_name, interrupted, print_json, progress, warn, working
 from dwell.model.bounds import counted
@@ -73,12 +72,10 @@ def study(
     if merge and shard is not None:
         raise typer.BadParameter("give --shard or --merge")
     mine = None if shard is None else Shard.read(shard)
-    require_one_length(windows, seconds)
     plan = load_study(file)
     if seeds is not None:
         plan = replace(plan, seeds=tuple(range(1, seeds + 1)))
-    if seconds is not None:
-        windows = windows_of(seconds, *(point.problem for point in plan.points))
+    windows = windows_of_study(windows, seconds, *(point.problem for point in plan.points))
     if windows is not None:
         plan = replace(plan, windows=windows)
     played = product(plan.points, plan.scenarios)

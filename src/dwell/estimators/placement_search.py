@@ -23,6 +23,7 @@ from dwell.estimators.any_placement import AnyPlacement, Measured
 from dwell.estimators.cost_bounds import CostBounds, Partial
 from dwell.estimators.prices import DISTURBED, MOST_CYCLES
 from dwell.estimators.slow_processes import mean_and_error
+from dwell.model.bounds import require
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.process import Constant
@@ -122,7 +123,8 @@ def search(
     Raises
     ------
     ProblemError
-        If the scenario does not exist, or the objective has ages or a cap on misses.
+        If the scenario does not exist, the objective has ages or a cap on misses, or a sink does
+        not run in `cycles`.
     PlacementError
         If no placement is feasible; with the reasons.
     SimulationError
@@ -151,9 +153,7 @@ def rank(
             raise SimulationError(
                 f"{name} is {value!r}; it must be a whole number of at least {least}"
             )
-    if cycles < (interval := problem.pipeline.sink_cycles):
-        bound = f"at least {interval}, the cycles from one run to the next of the slowest sink"
-        raise SimulationError(f"cycles is {cycles}; it must be {bound}")
+    require_runs(problem, cycles)
     # A realisation needs at least one candidate; replicas are not searched.
     named = problem.plain_candidates or {"first": _first_linked(problem)}
     controller = replace(problem.controller, initial=None, fallbacks=(), policy="dtp")
@@ -162,6 +162,19 @@ def rank(
     found = _Search(problem, samples, scenarios, top, most)
     found.run()
     return found.ranking()
+
+
+def require_runs(problem: Problem, cycles: int, path: str = "cycles") -> None:
+    """Refuse too few cycles for a run of each sink.
+
+    Raises
+    ------
+    ProblemError
+        If there are fewer; the fault is at `path`.
+    """
+    interval = problem.pipeline.sink_cycles
+    bound = f"at least {interval}, the cycles from one run to the next of the slowest sink"
+    require(cycles >= interval, path, cycles, bound)
 
 
 def rank_until_apart(

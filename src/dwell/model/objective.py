@@ -180,6 +180,20 @@ class Objective:
         """Whether J has a term of the mean age."""
         return self.weights.age > 0
 
+    def require_judgeable(self, other: Objective) -> None:
+        """Refuse another objective whose runs have no J by this one.
+
+        Raises
+        ------
+        ProblemError
+            If its latency is that of another chain, or its runs lack the mean age.
+        """
+        judges = "as in the cell, whose objective judges the runs of all policies"
+        path, bound = "objective.latency", f"{self.latency or 'absent'}, {judges}"
+        require(other.latency == self.latency, path, other.latency, bound)
+        measured = other.weighs_age or not self.weighs_age
+        require(measured, "objective.weights.age", other.weights.age, f"above 0, {judges}")
+
     @property
     def weighs_price(self) -> bool:
         """Whether J has a term of the price of transmitted bytes."""

@@ -136,6 +136,17 @@ class Problem(Displayed):
         if self.is_searched:
             self.objective.require_searchable()
 
+    def require_counted(self, windows: int, path: str = "windows") -> None:
+        """Refuse runs without a window after the warm-up.
+
+        Raises
+        ------
+        ProblemError
+            If the number of windows is at most that of the warm-up; the fault is at `path`.
+        """
+        bound = f"more than the {self.warmup_windows} windows of warm-up"
+        require(windows > self.warmup_windows, path, windows, bound)
+
     def require_simple(self, what: str) -> None:
         """Refuse cells that some features do not support; `what` names the features.
 

@@ -40,7 +40,8 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
         switching = np.array([moved[at : at + width].sum() for at in first.tolist()])
     else:
         switching = _moves(windows.names("placement"), problem)
-    _require_same_latency(run, problem)
+    problem.objective.require_judgeable(run.problem.objective)
+    _require_prices(run, problem)
     l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
     objective = problem.objective
     age_ms = windows["seen_age_ms"] if objective.weighs_age else 0.0
@@ -49,15 +50,9 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
     return price(l95_ms, rate, *used, switching, objective, age_ms, per_hour)
 
 
-def _require_same_latency(run: Run, problem: Problem) -> None:
-    """Raise a SimulationError if the windows of a run lack metrics of a problem's objective."""
-    own, judge = run.problem.objective, problem.objective
-    if own.latency != judge.latency or (judge.weighs_age and not own.weighs_age):
-        raise SimulationError(
-            f"a run with objective.latency {own.latency} and weights.age {own.weights.age:g} has "
-            f"no J with {judge.latency} and {judge.weights.age:g}; give all policies the same "
-            "objective.latency, and a weights.age above 0 if any has one"
-        )
+def _require_prices(run: Run, problem: Problem) -> None:
+    """Raise a SimulationError if J of a problem weighs prices, which the run's links lack."""
+    judge = problem.objective
     if judge.weighs_price and not run.problem.fabric.has_prices:
         raise SimulationError(
             f"a run whose links have no price_per_gb has no J with weights.price "

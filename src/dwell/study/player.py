@@ -192,6 +192,7 @@ class Player:
                 play_alone(problem, realisation) if any(map(_in_hindsight, contenders)) else None
             )
             for contender in contenders:
+                problem.objective.require_judgeable(self._problem(contender, index).objective)
                 self._simulate(contender, index, realisation, alone)
         self.prices.update(KNOWN_PRICES.known)
 

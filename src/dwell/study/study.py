@@ -172,8 +172,9 @@ class Study:
     SimulationError
         If a value is invalid or a name is ambiguous.
     ProblemError
-        If a scenario is unknown, a run is too long for 64 bits (see `Problem.cycles_of`), or the
-        references do not support a cell (see `Problem.require_simple`).
+        If a scenario is unknown, a run is too long for 64 bits (see `Problem.cycles_of`), or not
+        longer than the warm-up, or the references do not support a cell (see
+        `Problem.require_simple`).
     """
 
     name: str
@@ -243,11 +244,7 @@ class Study:
         problem.cycles_of(self.windows)
         if self.references:
             problem.require_simple("references")
-        if self.windows <= problem.warmup_windows:
-            raise SimulationError(
-                f"windows is {self.windows}; it must be more than the "
-                f"{problem.warmup_windows} windows of warm-up"
-            )
+        problem.require_counted(self.windows)
 
     @property
     def policies(self) -> tuple[str, ...]:
