@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, pairwise
+from itertools import accumulate, islice, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -235,6 +235,8 @@ class _Search:
         #: J of the best placements so far, at most as many as are returned, ascending.
         self._lowest: list[float] = []
         self._pruned: Counter[str] = Counter()
+        #: Number of simulated candidates by the nodes of their first tasks.
+        self._begun: Counter[tuple[str, ...]] = Counter()
         self._looked = 0
         self._left = math.inf
 
@@ -243,6 +245,9 @@ class _Search:
         for placement in (one.first for one in self._problem.plain_candidates.values()):
             if not self._is_overloaded(placement):
                 self._measure(placement)
+        for measured in self._measured:
+            canonical = self._canonical(measured.first, self._order).first
+            self._begun.update(accumulate((canonical[name],) for name in self._order))
         stack = [_Open(0.0, tuple(bounds.root for bounds in self._bounds))]
         while stack:
             if self._looked >= self._most:
@@ -250,7 +255,8 @@ class _Search:
                 return
             one = stack.pop()
             if self._exceeds(one.bound):
-                self._prune("with a higher bound", one.partials[0])
+                nodes = one.partials[0].nodes
+                self._prune("with a higher bound", nodes, self._begun[tuple(nodes.values())])
             elif len(one.partials[0].nodes) == len(self._order):
                 self._measure(one.partials[0].nodes)
             else:
@@ -288,7 +294,7 @@ class _Search:
 
     def _measure(self, nodes: Mapping[str, str]) -> None:
         """Simulate a placement on every sample."""
-        placement = self._canonical(nodes)
+        placement = self._canonical(nodes, self._problem.pipeline.tasks)
         if placement in self._measured:
             return
         objective, found = self._problem.objective, []
@@ -302,15 +308,11 @@ class _Search:
         insort(self._lowest, largest[0].cost)
         del self._lowest[self._top :]
 
-    def _canonical(self, nodes: Mapping[str, str]) -> Placement:
-        """Return the first placement in order that differs from this by twins only."""
+    def _canonical(self, nodes: Mapping[str, str], tasks: Iterable[str]) -> Placement:
+        """Return the first placement in an order of tasks that differs from this by twins only."""
         names = {node: node for node in self._problem.fabric.nodes}
         for group in self._twins:
-            used = [
-                node
-                for node in dict.fromkeys(nodes[task] for task in self._problem.pipeline.tasks)
-                if node in group
-            ]
+            used = [node for node in dict.fromkeys(nodes[task] for task in tasks) if node in group]
             names |= zip(used, group, strict=False)
         return Placement({task: names[nodes[task]] for task in self._problem.pipeline.tasks})
 
@@ -360,7 +362,7 @@ class _Search:
             )
             full = self._bounds[0].overloaded(partials[0])
             if full is not None:
-                self._prune(f"over the capacity of {full}", partials[0])
+                self._prune(f"over the capacity of {full}", partials[0].nodes)
                 continue
             self._looked += 1
             bound = max(
@@ -368,8 +370,9 @@ class _Search:
             )
             yield _Open(bound, partials)
 
-    def _prune(self, reason: str, partial: Partial) -> None:
-        self._pruned[reason] += self._completions(len(partial.nodes))
+    def _prune(self, reason: str, nodes: Mapping[str, str], simulated: int = 0) -> None:
+        """Count the placements with these nodes, except the simulated ones."""
+        self._pruned[reason] += self._completions(len(nodes)) - simulated
 
     def _completions(self, placed: int) -> int:
         """Return how many placements have the same nodes of the first tasks."""
