@@ -35,6 +35,7 @@ from dwell.model import (
     Targets,
     Task,
     Weights,
+    evolve,
 )
 from tests.cells.many import many
 from tests.cells.strategies import problems
@@ -136,6 +137,14 @@ PLACED = {"a": "R", "b": "R"}
             lambda: replace(_problem(), servo=Servo("integrator", 1.0, MovingTarget(1.0, 0.019))),
             "servo.target.period_s",
             "at least 0.02",
+        ),
+        (
+            lambda: evolve(
+                replace(_problem(), servo=Servo("integrator", 1.0, MovingTarget(1.0, 0.05))),
+                {"tasks.a.every": 3, "tasks.b.every": 3},
+            ),
+            "servo.target.period_s",
+            "at least 0.06, two frames of the camera",
         ),
         (
             lambda: replace(_problem(), live=LiveSettings(max_age_ms=9.9)),

@@ -27,5 +27,5 @@ def test_damping_is_for_the_double_integrator_alone() -> None:
 def test_a_target_is_sampled_twice_a_period_at_least() -> None:
     servo = Servo("integrator", 4.0, TARGET)
     servo.require_seen(2_000)
-    with pytest.raises(ProblemError, match=r"servo\.target\.period_s.*two periods of the cell"):
+    with pytest.raises(ProblemError, match=r"servo\.target\.period_s.*two frames of the camera"):
         servo.require_seen(2_001)

@@ -110,7 +110,8 @@ class Assembly:
         links, flows = list(self._links()), list(self._flows())
         timing = self._timing()
         objective = self._objective(nodes, timing.chains if timing is not None else {})
-        controller, servo = self._section("controller", ControllerSettings), self._servo()
+        controller = self._section("controller", ControllerSettings)
+        servo: Servo | None = self._made(self.entry.servo)
         live, scenarios = self._live(timing), self._scenarios()
         named, every = entry.candidates.named, self._made(entry.candidates.every)
         candidates, replicated = self._candidates(named)
@@ -341,12 +342,6 @@ class Assembly:
             elif moves is not None:
                 plain[name] = moves
         return plain, replicated
-
-    def _servo(self) -> Servo | None:
-        servo: Servo | None = self._made(self.entry.servo)
-        if servo is not None and not self.faults.at("period_ms"):
-            self.faults.attempt("", servo.require_seen, self.entry.period_ms)
-        return servo
 
     def _live(self, timing: Pipeline | None) -> LiveSettings | None:
         live: LiveSettings | None = self._section("live", LiveSettings)

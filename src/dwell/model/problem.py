@@ -91,8 +91,6 @@ class Problem(Displayed):
 
     def __post_init__(self) -> None:
         require_length(1, self.window_cycles, self.pipeline.period_ms, "window_cycles")
-        if self.servo is not None:
-            self.servo.require_seen(self.pipeline.period_ms)
         self.live.require_in_time(self.pipeline.deadline_ms)
         every, width = self.controller.decide_cycles, self.window_cycles
         bound = f"at most window_cycles = {width}; lower decide_cycles, or raise window_cycles"
@@ -112,6 +110,10 @@ class Problem(Displayed):
         self._require_searchable()
         self._require_due_sinks()
         self._require_supported_replicas()
+        if self.servo is not None:
+            chain = self.latency_chain
+            cycles = self.pipeline.chain_cycles(chain) if chain else self.pipeline.due_interval
+            self.servo.require_seen(cycles * self.pipeline.period_ms)
 
     def __repr__(self) -> str:
         """Return a summary of its parts; `dwell.model.document` has all of it."""

@@ -19,7 +19,7 @@ class MovingTarget:
         "Amplitude, mm; errors are proportional to it.", Bound(1e-6, MAX_COUNT)
     )
     period_s: float = key(
-        "Duration of one swing, s; at least two periods of the cell.", Bound(1e-5, LARGEST)
+        "Duration of one swing, s; at least two frames of the camera.", Bound(1e-5, LARGEST)
     )
 
     @property
@@ -55,15 +55,15 @@ class Servo:
             bound = "left out with an integrator, which needs none"
             require(self.damping == 0, "damping", self.damping, bound)
 
-    def require_seen(self, period_ms: float) -> None:
-        """Check that the target is slow enough for the camera, which takes one frame per cycle.
+    def require_seen(self, frame_ms: float) -> None:
+        """Check that the target is slow enough for a camera with a frame every `frame_ms`.
 
         Raises
         ------
         ProblemError
-            If the target's period is less than two of the cell's (the sampling theorem).
+            If the target's period is less than two frames (the sampling theorem).
         """
-        least_s = 2 * period_ms / 1e3
-        bound = f"at least {least_s:g}, two periods of the cell"
+        least_s = 2 * frame_ms / 1e3
+        bound = f"at least {least_s:g}, two frames of the camera"
         value_s = self.target.period_s
         require(value_s >= least_s, "servo.target.period_s", value_s, bound)
