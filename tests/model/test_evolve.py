@@ -8,7 +8,7 @@ import pytest
 
 import dwell
 from dwell.errors import ProblemError
-from dwell.model import Caps, Chain, Constant, LogNormal, Node, Placement, evolve
+from dwell.model import Caps, Chain, Constant, LogNormal, Node, Placement, Targets, evolve
 
 CANONICAL = dwell.load(Path(__file__).parents[2] / "examples" / "canonical.yaml")
 
@@ -122,6 +122,38 @@ def test_what_is_drawn_is_equal_where_only_settings_differ() -> None:
     assert found.drawn == CANONICAL.drawn
     assert hash(found.drawn) == hash(CANONICAL.drawn)
     assert evolve(CANONICAL, {"nodes.E.cores": 7}).drawn != CANONICAL.drawn
+
+
+def test_the_latency_target_defaults_to_the_one_of_a_file() -> None:
+    named = {"chains.reaction": CHAIN, "objective.latency": "reaction"}
+    given = {"objective.targets": {"robot": 0.6}}
+    chained = evolve(CANONICAL, named)
+    for problem, changes, target_ms in (
+        (CANONICAL, {}, CANONICAL.pipeline.deadline_ms),
+        (CANONICAL, {"deadline_ms": 30.0}, 30.0),
+        (CANONICAL, named, 200.0),
+        (chained, {}, 200.0),
+        (chained, {"chains.reaction.max_age_ms": 150.0}, 150.0),
+        (chained, {"objective.latency": None}, CANONICAL.pipeline.deadline_ms),
+    ):
+        found = evolve(problem, {**given, **changes})
+        assert found.objective.targets == Targets(target_ms, robot=0.6)
+
+
+@pytest.mark.parametrize(
+    ("outer", "inner"),
+    [
+        ("objective", "objective.targets"),
+        ("objective.targets", "objective.targets.robot"),
+        ("nodes.E", "nodes.E.cores"),
+        ("links[0]", "links[0].delay_ms"),
+    ],
+)
+def test_overlapping_paths_are_refused(outer: str, inner: str) -> None:
+    for changes in ({outer: {}, inner: 1}, {inner: 1, outer: {}}):
+        with pytest.raises(ProblemError) as caught:
+            evolve(CANONICAL, changes)
+        assert str(caught.value) == f"{inner}: is a part of {outer}; give one of them"
 
 
 def test_a_candidate_with_two_copies_is_given_whole() -> None:

@@ -42,7 +42,7 @@ from dwell.model.bounds import CLASS_PATH, require
 from dwell.model.declaration import declared_fields, made_at
 from dwell.model.fabric import accelerator_tiers
 from dwell.model.frozen import FrozenDict
-from dwell.model.objective import TARGET
+from dwell.model.objective import TARGET, latency_target_ms
 from dwell.model.process import DRAWN, UnreadTrace
 from dwell.model.replicated import Replicated
 from dwell.model.semantics import (
@@ -299,11 +299,10 @@ class Assembly:
         self, nodes: Mapping[str, Node | None], chains: Mapping[str, Chain]
     ) -> Objective | None:
         entry = self.entry.objective or Entry(OBJECTIVE, "objective", {})
-        target_ms = self.entry.deadline_ms or self.entry.period_ms
         chain = chains.get(entry.latency) if entry.latency is not None else None
+        target_ms = latency_target_ms(self.entry.deadline_ms or self.entry.period_ms, chain)
         given = entry.targets.values if entry.targets is not None else {}
         if chain is not None and chain.is_bounded and "latency_ms" not in given:
-            target_ms = chain.max_age_ms
             place = f"chains.{entry.latency}.max_age_ms"
             bound = f"{TARGET} to be the target of latency; or give objective.targets.latency_ms"
             self.faults.attempt("", require, TARGET.holds(target_ms), place, target_ms, bound)

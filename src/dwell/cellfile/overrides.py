@@ -7,7 +7,6 @@ at the place where it was given.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike, fspath
@@ -19,7 +18,7 @@ from dwell.cellfile.document_faults import Faults
 from dwell.cellfile.study_paths import put
 from dwell.errors import ProblemError
 from dwell.model import Problem
-from dwell.model.dotted_paths import Step, dotted, steps_of
+from dwell.model.dotted_paths import Step, dotted, overlap_faults, steps_of
 
 if TYPE_CHECKING:
     from dwell.cellfile.traces import Tables
@@ -112,9 +111,8 @@ def open_cell(file: Path, traces: Path | None = None) -> OpenCell:
 def check_apart(places: Mapping[str, tuple[Step, ...] | None], faults: Faults) -> None:
     """Refuse a path that begins with another path; the keys of `places` are for messages."""
     known = {place: steps for place, steps in places.items() if steps is not None}
-    for (place, inner), (_, outer) in itertools.permutations(known.items(), 2):
-        if inner[: len(outer)] == outer:
-            faults.add(place, f"is a part of {dotted(outer)}; give one of them")
+    for fault in overlap_faults(known):
+        faults.add(fault.path, fault.message)
 
 
 def load_with(

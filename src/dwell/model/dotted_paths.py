@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import reduce
 from typing import TypeAlias
 
@@ -31,6 +32,13 @@ def beneath(path: str, step: Step) -> str:
         return f"{path}[{step}]"
     key = step or "''"
     return f"{path}.{key}" if path else key
+
+
+def overlap_faults(places: Mapping[str, tuple[Step, ...]]) -> Iterator[Fault]:
+    """Yield a fault for each path that is a part of another; `places` are steps by their names."""
+    for (place, inner), (_, outer) in itertools.permutations(places.items(), 2):
+        if inner[: len(outer)] == outer:
+            yield Fault(place, f"is a part of {dotted(outer)}; give one of them")
 
 
 def steps_of(path: str, document: object) -> tuple[Step, ...]:

@@ -10,9 +10,10 @@ from dwell.errors import Fault, PlacementError, ProblemError
 from dwell.model.bounds import require
 from dwell.model.declaration import DeclaredField, declared_fields, is_declared, made_at
 from dwell.model.document import to_document
-from dwell.model.dotted_paths import Step, beneath, steps_of
+from dwell.model.dotted_paths import Step, beneath, overlap_faults, steps_of
 from dwell.model.fabric import Node
-from dwell.model.pipeline import Task
+from dwell.model.objective import latency_target_ms
+from dwell.model.pipeline import Pipeline, Task
 from dwell.model.placement import Placement, Replicas
 from dwell.model.problem import Problem
 from dwell.model.process import Constant, Process
@@ -49,21 +50,31 @@ def evolve(problem: Problem, changes: Mapping[str, object]) -> Problem:
     """
     document = to_document(problem)
     trees: dict[str, _Tree] = {}
-    for path, value in changes.items():
-        given = value
-        if path == "objective.targets" and isinstance(value, Mapping):
-            # As in a file, the latency target defaults to the deadline.
-            given = {"latency_ms": problem.pipeline.deadline_ms, **value}
-        *before, last = steps_of(path, document)
+    places = {path: steps_of(path, document) for path in changes}
+    if faults := [*overlap_faults(places)]:
+        raise ProblemError(faults)
+    for path, (*before, last) in places.items():
         first = before[0] if before else last
         home = next((name for name in AT_TOP if first in _keys(type(getattr(problem, name)))), "")
         tree: Any = trees.setdefault(home, {})
         for step in before:
             tree = tree.setdefault(step, {})
-        tree[last] = _Value(given)
-    whole = _arguments(problem, trees.pop("", {}), "")
+        tree[last] = _Value(changes[path])
+    top = trees.pop("", {})
     parts = {name: _changed(getattr(problem, name), tree, None, "") for name, tree in trees.items()}
-    return replace(problem, **parts, **whole)
+    _add_latency_target(top.get("objective"), problem, parts.get("pipeline", problem.pipeline))
+    return replace(problem, **parts, **_arguments(problem, top, ""))
+
+
+def _add_latency_target(tree: Any, problem: Problem, pipeline: Pipeline) -> None:
+    """Add the latency target to given targets without one, as a cell file does."""
+    targets = tree.get("targets") if isinstance(tree, dict) else None
+    if isinstance(targets, _Value) and isinstance(targets.value, Mapping):
+        named = tree.get("latency", _Value(problem.objective.latency))
+        chains = (chain for name, chain in pipeline.chains.items() if _Value(name) == named)
+        chain = next(chains, None)
+        target_ms = latency_target_ms(pipeline.deadline_ms, chain)
+        tree["targets"] = _Value({"latency_ms": target_ms, **targets.value})
 
 
 def _keys(kind: type) -> dict[str, DeclaredField]:

@@ -8,6 +8,7 @@ from typing import Literal, TypeAlias
 
 from dwell.errors import Fault, ProblemError
 from dwell.model.bounds import LARGEST, MAX_COUNT, Bound, require
+from dwell.model.chain import Chain
 from dwell.model.declaration import declared, key
 from dwell.model.frozen import FrozenDict
 
@@ -78,6 +79,11 @@ class Targets:
         TARGET,
         default=None,
     )
+
+
+def latency_target_ms(deadline_ms: float, chain: Chain | None) -> float:
+    """Return the target of latency where a cell gives none: of its chain, else the deadline."""
+    return chain.max_age_ms if chain is not None and chain.is_bounded else deadline_ms
 
 
 @declared("misses")
@@ -175,11 +181,6 @@ class Objective:
             message = "the search of placements does not support it; remove it, or list candidates"
             raise ProblemError([Fault(f"objective.{name}", message)])
 
-    @property
-    def weighs_age(self) -> bool:
-        """Whether J has a term of the mean age."""
-        return self.weights.age > 0
-
     def require_judgeable(self, other: Objective) -> None:
         """Refuse another objective whose runs have no J by this one.
 
@@ -193,6 +194,11 @@ class Objective:
         require(other.latency == self.latency, path, other.latency, bound)
         measured = other.weighs_age or not self.weighs_age
         require(measured, "objective.weights.age", other.weights.age, f"above 0, {judges}")
+
+    @property
+    def weighs_age(self) -> bool:
+        """Whether J has a term of the mean age."""
+        return self.weights.age > 0
 
     @property
     def weighs_price(self) -> bool:
