@@ -11,11 +11,13 @@ import dwell
 from dwell.cellfile.cell import from_document
 from dwell.model import Problem
 from dwell.report.charts import latency_limit
+from dwell.report.comparison_page import comparison_page
 from dwell.report.phases import phase_rows
 from dwell.report.run_header import RunHeader
 from dwell.report.run_page import run_page
 from dwell.report.study_page import study_page
-from dwell.study import Contender, Point, Study, open_study, run_study
+from dwell.study import Contender, Point, Study, compare, open_study, run_study
+from dwell.study.summary import GRID_PER_DEADLINE
 from tests.report.pages import figure_of, table_of
 
 
@@ -52,6 +54,20 @@ def test_phases_have_no_idle_cycles() -> None:
     assert math.isfinite(calm.l95_ms)
     assert math.isfinite(busy.l95_ms)
     assert busy.violation_rate == 1.0
+
+
+def test_equal_latencies_are_a_line_with_one_step() -> None:
+    free = sparse(nodes={"R": {"tier": "robot", "cores": 2}})
+    found = compare(
+        free, scenarios=("baseline",), policies=("R",), seeds=(1,), windows=3, processes=1
+    )
+    (rows,) = figure_of(comparison_page(found), "latencies").frames.values()
+    step_ms = sparse().pipeline.deadline_ms / GRID_PER_DEADLINE
+    *before, (at_ms, share) = rows.select("latency_ms", "longer").rows()
+    assert before[0] == (0.0, 1.0)
+    assert {longer for _, longer in before} == {1.0}
+    assert share == 0.0
+    assert 3.0 <= at_ms < 3.0 + step_ms
 
 
 def test_figures_have_no_idle_cycles() -> None:

@@ -261,8 +261,8 @@ def in_order(bars: Spec, parts: Mapping[str, str]) -> Spec:
 def distributions(frame: pl.DataFrame, styles: Mapping[str, Style], deadline_ms: float) -> Draw:
     """Draw the share of cycles that took longer than a latency, one panel per scenario.
 
-    `frame` has the columns ``scenario``, ``policy``, ``latency_ms`` and ``longer``, a share above
-    0.
+    `frame` has the columns ``scenario``, ``policy``, ``latency_ms`` and ``longer``, a share; 0 is
+    at the end of the axis.
     """
     up = quantity(
         "longer",

@@ -160,7 +160,8 @@ class PolicyBlocks:
             bins = np.round(np.log10(np.maximum(longer, LEAST_SHARE)) * POINTS / 4)
             keep = np.flatnonzero(np.diff(bins, prepend=math.inf))
             line = mine[keep].select(*KEYS, "latency_ms", longer=1 - pl.col("share"))
-            parts.append(line.filter(pl.col("longer") > 0))
+            # From latency 0, so that the line of equal latencies has its step, too.
+            parts += [line.head(1).with_columns(latency_ms=0.0, longer=1.0), line]
         frame = named(pl.concat(parts))
         return Figure(
             f"{self.prefix}latencies",
