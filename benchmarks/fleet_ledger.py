@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -15,6 +15,8 @@ from benchmarks.figures import Figure, Goal, Section
 from benchmarks.timing import Took, in_turns, shared_core, took
 from dwell.control.coordination import Verdict, Wish
 from dwell.control.ledger import Seat
+from dwell.estimators.candidate_player import CandidatePlayer
+from dwell.kernels.arrays import Arrays
 from dwell.model.fleet import Fleet, FleetEntry
 
 #: Share of the single cell's rate, by estimator and coordination.
@@ -23,6 +25,8 @@ GOALS = {
     ("corrected", "ledger"): Goal(low=0.4),
     ("profile", "none"): Goal(low=0.5),
 }
+#: Closes at which the ledger simulates nothing, and those at which it simulates the fleet.
+NOTHING, ROUND = "a close that proposes nothing", "a round"
 
 
 def measure(quick: bool) -> Section:
@@ -33,7 +37,7 @@ def measure(quick: bool) -> Section:
     nodes = {**cell.fabric.nodes, "E": replace(edge, cores=edge.cores * size)}
     big = replace(cell, fabric=replace(cell.fabric, nodes=nodes))
     fleet = Fleet("hall", (FleetEntry(big, size),), ("E",), "random", "ledger")
-    spent: dict[str, list[float]] = {"a close that proposes nothing": [], "a round": []}
+    spent: dict[str, list[float]] = {NOTHING: [], ROUND: []}
     figures, notes = [], []
     for (estimator, coordination), goal in GOALS.items():
         given = fleet.changed(estimator=estimator, coordination=coordination)
@@ -73,17 +77,22 @@ def _fleet(fleet: Fleet, windows: int) -> Took:
 @contextmanager
 def _timed(spent: dict[str, list[float]]) -> Iterator[None]:
     """Time what every seat of a ledger takes to consider a decision, by whether it is played."""
-    consider = Seat.consider
+    consider, play, plays = Seat.consider, CandidatePlayer.play, 0
+
+    def counted(self: CandidatePlayer, placed: Mapping[int, str]) -> Arrays:
+        nonlocal plays
+        plays += 1
+        return play(self, placed)
 
     def timed(self: Seat, wish: Wish) -> Verdict:
-        before, begin = self.ledger.round, time.perf_counter()
+        before, begin = plays, time.perf_counter()
         verdict = consider(self, wish)
-        what = "a close that proposes nothing" if self.ledger.round == before else "a round"
-        spent[what].append(1e6 * (time.perf_counter() - begin))
+        took_us = 1e6 * (time.perf_counter() - begin)
+        spent[NOTHING if plays == before else ROUND].append(took_us)
         return verdict
 
-    Seat.consider = timed  # type: ignore[method-assign]
+    Seat.consider, CandidatePlayer.play = timed, counted  # type: ignore[method-assign]
     try:
         yield
     finally:
-        Seat.consider = consider  # type: ignore[method-assign]
+        Seat.consider, CandidatePlayer.play = consider, play  # type: ignore[method-assign]
