@@ -6,6 +6,7 @@ given.
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Mapping
@@ -121,6 +122,11 @@ class StandIn:
                 "violation_rate": 0.1,
                 "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
                 "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},
+                "ages": {
+                    "age_l95_reaction": 80.0,
+                    "age_missed_reaction": 0.25,
+                    "reaction_l95_reaction": math.inf,
+                },
             },
             "processes": {who: {"heard": True, "ready": True, "note": ""} for who in members},
             "certificates": {"R1": {"expires": "2030-01-01", "days": 3.5, "soon": True}},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import subprocess
@@ -17,6 +18,8 @@ from prometheus_client.parser import text_string_to_metric_families as plain_tex
 from dwell.dash.metrics import CellMetrics
 from dwell.live.host.security import Security
 from dwell.live.trust.authority import Authority
+from dwell.model import evolve
+from tests.cells.small import make_problem
 from tests.dash.stand_in import StandIn
 from tests.live.replicated_cells import replicated
 from tests.waiting import wait_until
@@ -115,6 +118,15 @@ def test_exemplars_name_run_and_cycle(cell: StandIn) -> None:
     }
     assert found["0.05"] == ({"run": "7", "cycle": "3"}, 0.045)
     assert families["dwell_placement"].type == "info"
+
+
+def test_ages_of_chains() -> None:
+    chain = {"from": "sensing", "to": "control", "max_age_ms": 60.0}
+    cell = StandIn(evolve(make_problem(), {"chains": {"reaction": chain}}))
+    cell.well()
+    assert value(cell, "dwell_chain_age_seconds", chain="reaction") == 0.08
+    assert value(cell, "dwell_chain_age_missed_ratio", chain="reaction") == 0.25
+    assert value(cell, "dwell_chain_reaction_seconds", chain="reaction") == math.inf
 
 
 @pytest.mark.parametrize("accept", ["", "*/*", "text/html", PLAIN])

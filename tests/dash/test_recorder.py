@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import time
@@ -44,6 +45,7 @@ WINDOW = {
     "estimates": {"LOC": 1.5, "SO": None, "HYB": 2.5},
     "predicted": {"LOC": {"l95_ms": 30.0, "violation_rate": 0.2}},
     "utilisation": {"R1": 0.5, "R2": 0.25, "E": None},
+    "ages": {"age_l95_see": 80.0, "age_missed_see": 0.25, "reaction_l95_see": math.inf},
     "age_ms": 20.0,
 }
 
@@ -81,6 +83,8 @@ def test_what_is_heard_is_in_the_file_at_the_time_of_day(tmp_path: Path) -> None
     ((at_ns, window),) = of_topic(file, "/windows")
     assert at_ns == cycles[0][0] + 90_000_000
     assert (window["seen_l95_ms"], window["u_R1"], "u_E" in window) == (31.5, 0.5, False)
+    assert (window["age_l95_see"], window["age_missed_see"]) == (80.0, 0.25)
+    assert "reaction_l95_see" not in window
     ((_, decision),) = of_topic(file, "/decisions")
     assert (decision["reason"], decision["j_HYB"], "j_SO" in decision) == ("hold", 2.5, False)
     assert (decision["est_l95_ms_LOC"], "est_l95_ms_SO" in decision) == (30.0, False)

@@ -78,6 +78,21 @@ def test_the_age_of_a_sampled_picture_takes_the_place_of_the_latency() -> None:
     assert status["predicted"]["LOC"]["age_ms"] > 0
 
 
+@pytest.mark.parametrize("every", [SLOW, 2 * SLOW])
+def test_the_status_has_ages_and_reaction_times_of_chains(every: int) -> None:
+    chains = {"see-act": {"from": "camera", "to": "act", "max_age_ms": 40}}
+    problem = sampling(chains=chains)
+    controller = replace(problem.controller, decide_cycles=every, min_dwell_cycles=0)
+    frequent = replace(problem, window_cycles=2 * SLOW, controller=controller)
+    world = world_of(frequent, policy=Staying())
+    world.run(1_500)
+    names = "age_l95_see-act", "age_missed_see-act", "reaction_l95_see-act"
+    steady = {*columns(world, "windows", *names)[2:]}
+    assert len(steady) == 1
+    assert world.status["window"]["cycles"] == every
+    assert world.status["window"]["ages"] == dict(zip(names, *steady, strict=True))
+
+
 def test_the_headline_names_the_chain_whose_data_are_too_old() -> None:
     chains = {
         "see-act": {"from": "camera", "to": "act", "max_age_ms": 40},

@@ -21,6 +21,7 @@ from dwell.live.roles.controlled_cell import MOVED_BY
 from dwell.live.roles.health import Health
 from dwell.live.wire.keys import CONTROLLER
 from dwell.live.wire.wiring import roles
+from dwell.model import Problem
 
 Kind: TypeAlias = Literal["counter", "gauge", "info", "summary"]
 
@@ -47,6 +48,12 @@ SENTENCES: Mapping[Kind, Mapping[str, str]] = {
         "dwell_estimated_cost": "Estimated cost J of a candidate at the last decision.",
         "dwell_utilisation_ratio": "Utilisation of a resource over the cycles of the last "
         "decision, foreign work included.",
+        "dwell_chain_age_seconds": "L95 of a chain's data age over the cycles of the last "
+        "decision; infinite without an actuation.",
+        "dwell_chain_age_missed_ratio": "Share of a chain's actuations in these cycles that are "
+        "older than its max_age_ms.",
+        "dwell_chain_reaction_seconds": "L95 of a chain's reaction times that end in these cycles; "
+        "infinite without one.",
         "dwell_clock_bound_seconds": "Largest error of latencies in the last window due to the "
         "clocks.",
         "dwell_window_unproven": "Whether clock errors or lost messages leave the last window "
@@ -169,6 +176,7 @@ class CellMetrics(Collector):
                 ({"node": one.node, "kind": one.kind or "cpu"}, used.get(name))
                 for name, one in resources.items()
             ],
+            **_chains(problem, window.get("ages") or {}),
             "dwell_clock_bound_seconds": [({}, None if bound_ms is None else bound_ms / 1e3)],
             "dwell_window_unproven": [({}, status.get("unproven"))],
             "dwell_stage_seconds": [
@@ -218,6 +226,23 @@ class CellMetrics(Collector):
                     exemplar = {"run": str(cycle.run), "cycle": str(cycle.number)}
                     of_cell = self._latency.labels(self._problem.name)
                     of_cell.observe(cycle.latency_ns / 1e9, exemplar)
+
+
+def _chains(problem: Problem, ages: Mapping[str, Any]) -> dict[str, Samples]:
+    """Return the data ages and reaction times of the chains, from columns of ``windows``."""
+    columns = {
+        "dwell_chain_age_seconds": ("age_l95", 1e-3),
+        "dwell_chain_age_missed_ratio": ("age_missed", 1.0),
+        "dwell_chain_reaction_seconds": ("reaction_l95", 1e-3),
+    }
+    return {
+        name: [
+            ({"chain": chain}, ages[f"{column}_{chain}"] * factor)
+            for chain in problem.pipeline.chains
+            if f"{column}_{chain}" in ages
+        ]
+        for name, (column, factor) in columns.items()
+    }
 
 
 def _totals(stages: Mapping[str, Any], flows: Mapping[str, Any]) -> dict[str, Samples]:

@@ -152,6 +152,7 @@ class CellRecorder:
                 "seen_violation_rate": said.get("violation_rate"),
                 "cost": said.get("cost"),
                 **{f"u_{name}": used.get(name) for name in known.fabric.resources},
+                **(said.get("ages") or {}),
             },
         )
         yield (

@@ -612,7 +612,8 @@ class ControlledCell:
         elif target == course.placement:
             self.controller.commit(proposal)
         if windows.last is not None:
-            self._window, self._window_ns = looked.shown(proposal, self.controller), now_ns
+            self._window_ns = now_ns
+            self._window = looked.shown(proposal, self.controller, windows.record.ages)
         if target != course.placement:
             self._begin(target, now_ns, proposal if target == wanted else None)
 

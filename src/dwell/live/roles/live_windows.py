@@ -20,7 +20,7 @@ which no sink is due count in windows, but not in their metrics.
 from __future__ import annotations
 
 import bisect
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -30,6 +30,7 @@ import numpy as np
 from dwell.control import ClosedWindow, Controller, LookedAt
 from dwell.errors import LiveError
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
+from dwell.live.roles.data_ages import KnownOrigins
 from dwell.live.roles.loads import ProcessLoads
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.roles.run_rows import LiveWindow, Resume, RunRows, sends_shadows
@@ -465,7 +466,17 @@ class LiveWindows:
             first -= 1
         closed = self._closed(first, end)
         closed.recent = self._closed(begin, end)
-        return self._seen(line[first:end], closed, line[end].at_ns), closed
+        looked = self._seen(line[first:end], closed, line[end].at_ns)
+        looked.known_origins = self._known_before(first)
+        return looked, closed
+
+    def _known_before(self, place: int) -> Mapping[str, KnownOrigins]:
+        """Return the origins of the actuations before a place in the line."""
+        record, window = self.record, self.record.window_of(self._line[place])
+        if window is None:
+            return record.ages.after(self._line[self._window.at : place], record.ages.known)
+        earlier = window.cycles[: window.cycles.index(self._line[place])]
+        return record.ages.after(earlier, window.known_origins)
 
     def _closed(self, begin: int, end: int) -> ClosedWindow:
         """Return the cycles between two places in the line as input of policies and estimators."""

@@ -68,7 +68,7 @@ class LiveWindow:
     rate_at_close : float
         V_D as known at the end of the window.
     known_origins : dict of str to KnownOrigins
-        Origins of the actuations before the window, by chain.
+        Origins of the actuations before its cycles, by chain.
     age_ms : float or None
         Mean age of the newest command, if J weighs it.
     used : float64 array, shape (3, resources)
@@ -92,7 +92,7 @@ class LiveWindow:
     known_origins: Mapping[str, KnownOrigins] = field(default_factory=dict)
     age_ms: float | None = None
 
-    def shown(self, proposal: Proposal, controller: Controller) -> dict[str, Any]:
+    def shown(self, proposal: Proposal, controller: Controller, ages: DataAges) -> dict[str, Any]:
         """Return a proposal and its cycles for the status."""
         decision, names = proposal.decision, controller.problem.candidates
         l95_ms, _, cost = proposal.seen
@@ -107,6 +107,7 @@ class LiveWindow:
             "violation_rate": self.rate_at_close,
             "cost": cost,
             "mean_age_ms": self.age_ms,
+            "ages": ages.values(self.cycles, self.known_origins),
             "reason": decision.reason,
             "decided": decision.name,
             "estimates": {name: decision.costs.get(name) for name in names},
@@ -193,6 +194,10 @@ class RunRows:
             if old.window is not None:
                 self._windows.pop(old.window, None)
             yield old
+
+    def window_of(self, cycle: LiveCycle) -> LiveWindow | None:
+        """Return the closed window that contains a cycle, if it is still kept."""
+        return None if cycle.window is None else self._windows.get(cycle.window)
 
     def close(self, window: LiveWindow) -> None:
         """Record a window."""
