@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from dwell.dash.observer import Observer
+from dwell.live.host.operator_client import OperatorClient
 from dwell.live.transport.zenoh import ZenohTransport
 from dwell.live.trust import KEYS
 from dwell.live.trust.authority import Authority
@@ -48,6 +49,27 @@ def speaking(problem: Problem, authority: Authority) -> Iterator[ZenohTransport]
     finally:
         controller.close()
         stamper.close()
+
+
+def test_a_client_that_watches_uses_newer_keys(problem: Problem, tmp_path: Path) -> None:
+    authority = issued(problem, tmp_path / "keys")
+    mine = Path(shutil.copytree(authority.folder / "operator", tmp_path / "operator"))
+    with OperatorClient(problem, {KEYS: str(mine)}) as client:
+        looks = client.watch(0.4)
+
+        def answers() -> bool:
+            return next(looks).get("certificates") == authority.roster.number
+
+        with speaking(problem, authority):
+            wait_until(answers, "an answer")
+        # First the controller gets a certificate, then the operator; the old ones are revoked.
+        for name in ("controller", "operator"):
+            authority.revoke(name)
+            authority.issue(name, name, ["127.0.0.1"])
+            with speaking(problem, authority):
+                assert next(looks)["health"] == "absent"
+                shutil.copytree(authority.folder / "operator", mine, dirs_exist_ok=True)
+                wait_until(answers, "an answer by newer keys")
 
 
 def test_newer_keys_are_used_while_it_looks(

@@ -9,7 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -263,19 +263,16 @@ def status(
         raise typer.Exit(ExitCode.FAILED)
 
 
-def _watch(visitor: OperatorClient, *, stages: bool, as_json: bool) -> NoReturn:
+def _watch(visitor: OperatorClient, *, stages: bool, as_json: bool) -> None:
     """Print the status of a cell every second until interrupted."""
     screen = sys.stdout.isatty() and not as_json
-    while True:
-        until_s = time.monotonic() + WATCH_S
-        answer = visitor.look(patience_s=WATCH_S)
+    for answer in visitor.watch(WATCH_S):
         if as_json:
             typer.echo(json_text(answer, None))
         elif screen:
             typer.echo(_drawn(status_lines(answer, stages=stages)), nl=False)
         else:
             typer.echo("\n".join((*status_lines(answer, stages=stages), "")))
-        time.sleep(max(until_s - time.monotonic(), 0.0))
 
 
 def _drawn(lines: list[str]) -> str:

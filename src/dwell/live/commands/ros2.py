@@ -50,9 +50,7 @@ def diagnostics(
     try:
         with OperatorClient(problem, environment(keys, insecure=insecure)) as visitor:
             trouble = ""
-            while True:
-                until_s = time.monotonic() + EVERY_S
-                status = visitor.look(patience_s=EVERY_S)
+            for status in visitor.watch(EVERY_S):
                 try:
                     sink.apply(Message(fields_of(problem, status, time.time_ns())))
                 except LiveError as error:
@@ -63,7 +61,6 @@ def diagnostics(
                     trouble = ""
                     if once:
                         return
-                time.sleep(max(until_s - time.monotonic(), 0.0))
     finally:
         sink.stop()
 

@@ -6,7 +6,9 @@ import itertools
 import queue
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -49,6 +51,9 @@ class OperatorClient:
         role = Role(self.name, problem.controller_node, "visitor")
         #: By default as the environment sets it.
         self.security = security or Security.of(problem, role, environment)
+        self._connect()
+
+    def _connect(self) -> None:
         self._transport = self.security.visit(self.name, self._controller)
         self._transport.subscribe(self._keys.of(channels.ANSWER, "*"), self._heard)
 
@@ -101,6 +106,35 @@ class OperatorClient:
         if self._answered_s is None:
             return {**status, "answer_age_ms": None}
         return {**status, "answer_age_ms": round((time.monotonic() - self._answered_s) * 1e3, 1)}
+
+    def watch(self, every_s: float) -> Iterator[dict[str, Any]]:
+        """Yield the status (see `look`) once per `every_s`, without end, also by newer keys."""
+        while True:
+            until_s = time.monotonic() + every_s
+            status = self.look(patience_s=every_s)
+            yield status
+            self._renew(whole=status["health"] == "absent")
+            time.sleep(max(until_s - time.monotonic(), 0.0))
+
+    def _renew(self, *, whole: bool) -> None:
+        """Connect again if the folder of the keys has a newer roster or, if `whole`, other keys.
+
+        The cell rejects a new certificate until it uses a roster that lists it, so the certificate
+        waits until the controller does not answer.
+        """
+        if (own := self.security.keyring) is None:
+            return
+        from dwell.live.trust.keyring import Keyring
+
+        # Incomplete files, which a user is still copying, wait for the next look.
+        with suppress(TrustError, OSError):
+            new = Keyring.open(own.folder, cell=self.problem.name)
+            newer = new.roster.number - own.roster.number
+            if newer > 0 or (whole and not newer and new.own != own.own):
+                keyring = new if whole else own.with_roster(new)
+                self._transport.close()
+                self.security = replace(self.security, keyring=keyring)
+                self._connect()
 
     def _answer(self, what: str, about: str, patience_s: float) -> Answer | None:
         """Repeat a request until the controller answers, or the time is over."""
