@@ -140,6 +140,14 @@ def test_a_run_with_a_broken_record_is_refused(tmp_path: Path, text: str) -> Non
     assert_refused(call("report", folder))
 
 
+def test_a_run_that_ended_in_its_warm_up_is_refused(tmp_path: Path) -> None:
+    folder = tmp_path / "short"
+    dwell.simulate(make_problem(), scenario="baseline", seed=1, windows=1).save(folder)
+    refused = f"error: {folder}: none of 1 windows is left after the warm-up; ask for more windows"
+    assert_refused(call("report", folder), refused)
+    assert not (folder / "report.html").exists()
+
+
 def test_a_page_that_cannot_be_written_is_a_failure(cell: Path) -> None:
     call("run", cell, "--windows", "12", "--out", "kept")
     result = call("report", "kept", "--out", "small.yaml/report.html")

@@ -24,7 +24,7 @@ from dwell.cli.output import (
     write_file,
     write_report,
 )
-from dwell.errors import RunError
+from dwell.errors import RunError, SimulationError
 from dwell.record.run import NO_JOBS
 
 if TYPE_CHECKING:
@@ -97,7 +97,10 @@ def report(
     if cells:
         extras["cells"] = _write_cells(folder, static=static)
     with working("writing the report"):
-        document = _page_of(folder, kind, run, page)
+        try:
+            document = _page_of(folder, kind, run, page)
+        except SimulationError as error:
+            raise RunError(f"{folder}: {error}") from None
         files = {} if run is None else _files(run, trace, mcap)
         write_report(document, page, figures=figures, static=static, mark=mark)
         for path, content in files.items():
