@@ -13,6 +13,7 @@ import polars as pl
 import polars.testing
 import pytest
 
+import dwell
 from dwell.estimators import Evidence
 from dwell.estimators.measured import Message, Meter
 from dwell.live.wire import channels
@@ -22,7 +23,7 @@ from dwell.model import Problem
 from dwell.model.scenario import LinkDisturbance
 from tests.live.rated_cells import SLOW, document, rated, world_of
 from tests.live.replayed import SYNCHRONOUS, Clocks, messages_of, recorded, replay, simulate
-from tests.live.small_world import Counting, Staying, canonical, columns
+from tests.live.small_world import Counting, Staying, World, canonical, columns
 
 GUARDED = {"on": "E", "initial": "EDGE", "fallbacks": ["LOC"]}
 
@@ -58,6 +59,22 @@ def test_idle_cycles_are_recorded_and_count_in_no_metric() -> None:
     assert all(rate == 0 and 3 < l95_ms < 6 and not proven for rate, l95_ms, proven in windows)
     assert {*columns(world, "decisions", "reason")} == {("hold",)}
     assert (world.status["health"], world.status["headline"]) == ("ok", None)
+
+
+def test_cycles_that_a_later_cycle_of_a_faster_sink_overtakes_are_counted() -> None:
+    controller = {"on": "E", "initial": "LOC"}
+    tasks = document()["tasks"]
+    tasks["fuse"]["on"] = {node: {"exec_ms": 25} for node in ("R", "E")}
+    problem = rated(deadline_ms=45, tasks=tasks, controller=controller)
+    exec_ms = dict.fromkeys(problem.pipeline.tasks, 1.0) | {"fuse": 25.0}
+    world = World(problem, exec_ms=exec_ms, policy="LOC")
+    world.run(1_500)
+    simulated = dwell.simulate(problem, policy="LOC", seed=1, windows=3).windows["overtaken"]
+    # Each command of the arm takes longer than the next commands of the wheels.
+    assert simulated.to_list() == [20 // SLOW] * 3
+    counts = [count for (count,) in columns(world, "windows", "overtaken")]
+    assert {*counts} == {20 // SLOW}
+    assert len(counts) >= 4
 
 
 def test_decisions_without_a_due_sink_are_missed() -> None:

@@ -111,11 +111,13 @@ class LiveWindows:
         self._deadline_ns = problem.pipeline.deadline_ns
         self._proven_ns = int(PROVEN_SHARE * self._deadline_ns)
         self._longest = 8 * self._size + KEPT_CYCLES
+        self._by_key: dict[tuple[int, int], LiveCycle] = {}
         #: Rows to record.
         self.record = RunRows(
             *(controller, self._ledger, self._processes),
             resume=resume,
             kept=4 * self._size + KEPT_CYCLES,
+            known=self._by_key,
         )
         #: Whether decisions are more frequent than windows.
         self.often = problem.decide_cycles < self._size
@@ -124,7 +126,6 @@ class LiveWindows:
         # In order of release: decided cycles that the next decision may look at, then cycles that
         # no closed window contains. `_by_key` has all cycles that are kept.
         self._line: list[LiveCycle] = []
-        self._by_key: dict[tuple[int, int], LiveCycle] = {}
         self._newest: tuple[LiveCycle, int | None] | None = None
         # Run and term that the migration under way will end.
         self._left: tuple[int, int] | None = None

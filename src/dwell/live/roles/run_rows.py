@@ -17,7 +17,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from dwell.control import Controller, Proposal, final_l95_ms
+from dwell.control import Controller, Proposal, final_l95_ms, overtaken_cycles
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
 from dwell.live.roles.data_ages import DataAges, KnownOrigins
 from dwell.live.roles.loads import ProcessLoads
@@ -146,7 +146,8 @@ def columns_of(controller: Controller, *, jobs: bool = False) -> Columns:
 class RunRows:
     """Makes the rows of a run that are new or have changed.
 
-    `kept` is the number of recorded cycles whose rows late completions may still change.
+    `kept` is the number of recorded cycles whose rows late completions may still change, and
+    `known` has these cycles and all later ones, by run and number.
     """
 
     def __init__(
@@ -157,8 +158,10 @@ class RunRows:
         *,
         resume: Resume,
         kept: int,
+        known: Mapping[tuple[int, int], LiveCycle],
     ) -> None:
         self._controller, self._ledger, self._processes = controller, ledger, processes
+        self._known = known
         problem = controller.problem
         #: Data ages of the cell's chains.
         self.ages = DataAges(problem, ledger)
@@ -320,7 +323,7 @@ class RunRows:
             # Only the simulator measures prices.
             **({"seen_price_per_hour": None} if self._has_prices else {}),
             **self.ages.values(cycles, known),
-            "overtaken": sum(cycle.overtaken for cycle in cycles),
+            "overtaken": self._overtaken(cycles),
             "term": cycles[-1].term,
             "lead": window.lead,
             "heard": window.heard,
@@ -338,6 +341,12 @@ class RunRows:
                 for name, share in zip(names, by_shadows, strict=True)
             }
         return values
+
+    def _overtaken(self, cycles: Sequence[LiveCycle]) -> int:
+        """Return how many cycles of a window completed after a later cycle."""
+        known = sorted(key for key in self._known if key >= cycles[0].key)
+        ends_ns = [(self._known[key].at_ns, self._known[key].latency_ns) for key in known]
+        return int(overtaken_cycles(*np.array(ends_ns).T)[: len(cycles)].sum())
 
     def _job_values(self, *, last: bool) -> Mapping[str, Iterable[Values]]:
         end = self.next_row if last else self.next_row - self._size
