@@ -123,8 +123,8 @@ def test_the_declared_demands_are_those_that_windows_would_show() -> None:
         TO_B: {2.0},
         TO_C: {2.0},
     }
-    assert set(declared.l95_ms["LOC"]) == {84.0}
-    assert set(declared.violation_rate["LOC"]) == {0.0}
+    assert set(declared.windows["LOC"].l95_ms) == {84.0}
+    assert set(declared.windows["LOC"].violation_rate) == {0.0}
     assert declared_of(problem) is declared
 
 

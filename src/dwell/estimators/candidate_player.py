@@ -17,7 +17,6 @@ from dwell.kernels.advance import play
 from dwell.kernels.arrays import Arrays, lay_out
 from dwell.kernels.codes import LAST_NS
 from dwell.kernels.realisation import NodeChange, NodeChanges, Realisation
-from dwell.kernels.rows import Rows
 from dwell.model.bounds import counted
 from dwell.model.fabric import Node
 from dwell.model.number_arrays import Floats, Ints
@@ -27,42 +26,20 @@ from dwell.model.problem import Problem
 class PlayedWindows(NamedTuple):
     """Simulated windows of a cell that stays on a candidate."""
 
-    #: Rows of the table ``seen``.
-    seen: Rows
+    #: L95 as a controller measures it.
+    l95_ms: Floats
+    #: L95 without the bound ``problem.censor_ms``.
+    uncut_ms: Floats
+    #: Mean age of the newest command; 0 unless J weighs it.
+    age_ms: Floats
+    #: Price of transmitted bytes; 0 without prices.
+    price_per_hour: Floats
+    #: Number of cycles that missed the deadline.
+    missed: Ints
+    #: Number of cycles in which a sink is due.
+    counted: Ints
     #: Shares of each resource, shape (windows, `PARTS`, resources).
     shares: Floats
-    #: W.
-    cycles: int
-
-    @property
-    def l95_ms(self) -> Floats:
-        """L95 as a controller measures it."""
-        return self.seen["l95_ms"]
-
-    @property
-    def uncut_ms(self) -> Floats:
-        """L95 without the bound ``problem.censor_ms``."""
-        return self.seen["uncut_ms"]
-
-    @property
-    def age_ms(self) -> Floats:
-        """Mean age of the newest command; 0 unless J weighs it."""
-        return self.seen["age_ms"]
-
-    @property
-    def price_per_hour(self) -> Floats:
-        """Price of transmitted bytes; 0 without prices."""
-        return self.seen["price_per_hour"]
-
-    @property
-    def missed(self) -> Ints:
-        """Number of cycles that missed the deadline."""
-        return self.seen["missed"]
-
-    @property
-    def counted(self) -> Ints:
-        """Number of cycles in which a sink is due."""
-        return self.seen["counted"]
 
     @property
     def violation_rate(self) -> Floats:
@@ -161,9 +138,9 @@ class CandidatePlayer:
     ) -> PlayedWindows:
         """Return some windows of a cell, from `first` until before `last`."""
         part, tables, stretch = arrays.parts[index], arrays.tables, slice(first, last)
-        shares = tables.shares[part.row, stretch, :, : part.resources]
-        cycles = self.cells[index][0].window_cycles
-        return PlayedWindows(tables.seen[part.row, stretch], shares, cycles)
+        seen = tables.seen[part.row, stretch]
+        columns = (seen[name] for name in PlayedWindows._fields[:-1])
+        return PlayedWindows(*columns, tables.shares[part.row, stretch, :, : part.resources])
 
 
 def _to_measure(problem: Problem, real: Realisation) -> Realisation:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dwell.estimators.candidate_player import CandidatePlayer, with_windows_up_to
+from dwell.estimators.candidate_player import CandidatePlayer, PlayedWindows, with_windows_up_to
 from dwell.estimators.evidence import Evidence
 from dwell.estimators.measured import Meter, Part, parts_of, patience_of
 from dwell.estimators.pool import Reference
@@ -21,7 +21,6 @@ from dwell.kernels.arrays import CellArrays, flow_columns
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
 from dwell.model.frozen import FrozenDict
-from dwell.model.number_arrays import Floats
 from dwell.model.problem import Problem
 from dwell.model.shadow_plan import ShadowFraction
 
@@ -40,14 +39,8 @@ class Declared:
     realisation: Realisation
     #: Demands of every part, as windows would measure them.
     references: Mapping[Part, Reference]
-    #: L95 of every window, by candidate.
-    l95_ms: Mapping[str, Floats]
-    #: V_D of every window, by candidate.
-    violation_rate: Mapping[str, Floats]
-    #: Mean age of every window, by candidate; 0 unless J weighs it.
-    age_ms: Mapping[str, Floats]
-    #: Price of transmitted bytes of every window, by candidate; 0 without prices.
-    price_per_hour: Mapping[str, Floats]
+    #: Every window, by candidate.
+    windows: Mapping[str, PlayedWindows]
     #: The simulated shadow jobs, if they slow any candidate down.
     shadows: SentShadows | None = None
 
@@ -74,24 +67,12 @@ def _played(question: Question) -> Declared:
         player = CandidatePlayer([(problem, plain.realisation)], shadows=shadows)
         # Shadow jobs delay only these candidates.
         slowed = _shown(player, [n for n, of in question.shadow_fractions.items() if of])
-        known = plain.l95_ms, plain.violation_rate, plain.age_ms, plain.price_per_hour
-        l95_ms, rates, age_ms, per_hour = (
-            FrozenDict({**one, **other}) for one, other in zip(known, slowed, strict=True)
-        )
-        return replace(
-            plain,
-            l95_ms=l95_ms,
-            violation_rate=rates,
-            age_ms=age_ms,
-            price_per_hour=per_hour,
-            shadows=shadows,
-        )
+        return replace(plain, windows=FrozenDict({**plain.windows, **slowed}), shadows=shadows)
     windows = max(-(-DRAWN // problem.window_cycles), FEWEST)
     real = _drawn_as_declared(problem, question.seed, windows)
     shown = _shown(CandidatePlayer([(problem, real)]), problem.candidates)
     references = _references(problem, question.seed, windows)
-    l95_ms, rates, age_ms, per_hour = map(FrozenDict, shown)
-    return Declared(real, FrozenDict(references), l95_ms, rates, age_ms, per_hour)
+    return Declared(real, FrozenDict(references), FrozenDict(shown))
 
 
 def _references(problem: Problem, seed: int, windows: int) -> dict[Part, Reference]:
@@ -123,15 +104,10 @@ def _drawn_as_declared(problem: Problem, seed: int, windows: int) -> Realisation
     return Drawing(problem, "baseline", seed=seed, windows=windows, wraps=True).take(windows)
 
 
-def _shown(player: CandidatePlayer, names: Iterable[str]) -> tuple[dict[str, Floats], ...]:
-    """Return L95 (ms), V_D, mean age (ms) and price per hour of every window, by candidate."""
+def _shown(player: CandidatePlayer, names: Iterable[str]) -> dict[str, PlayedWindows]:
+    """Return every window of candidates, copied from the tables of the simulation."""
     shown = {name: player.windows(player.play({0: name})) for name in names}
-    return (
-        {name: windows.l95_ms.copy() for name, windows in shown.items()},
-        {name: windows.violation_rate for name, windows in shown.items()},
-        {name: windows.age_ms.copy() for name, windows in shown.items()},
-        {name: windows.price_per_hour.copy() for name, windows in shown.items()},
-    )
+    return {name: PlayedWindows(*map(np.copy, windows)) for name, windows in shown.items()}
 
 
 def _evidence_of(player: CandidatePlayer, name: str) -> Evidence:

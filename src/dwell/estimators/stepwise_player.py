@@ -101,13 +101,13 @@ class StepwisePlayer:
         self._window = played.window_cycles
         self._names, self._resources = tuple(problem.candidates), tuple(problem.fabric.resources)
         self._step, self._censor_ms = max(STEP // self._window, 1), problem.censor_ms
-        #: Standard deviations of a step's L95 (ms) and V_D, as declared.
+        #: Standard deviations of a step's L95 (ms), V_D, mean age (ms) and price, as declared.
         self._usual = {
             name: [
-                float(windows[name][1:].std()) / math.sqrt(self._step)
-                for windows in (self.declared.l95_ms, self.declared.violation_rate)
+                float(windows[1:].std()) / math.sqrt(self._step)
+                for windows in (of.l95_ms, of.violation_rate, of.age_ms, of.price_per_hour)
             ]
-            for name in self._names
+            for name, of in self.declared.windows.items()
         }
         self.cycles = 0
         self._misses = misses = problem.objective.caps.misses
@@ -182,19 +182,20 @@ class StepwisePlayer:
         first = max(first, 1)  # in the first window queues have not settled
         if first < last:
             windows = self._player.windows(twin.arrays, 0, first, last)
+            declared = self.declared.windows[name]
             means = (
                 _mean(windows.l95_ms),
-                _mean(self.declared.l95_ms[name][first:last]),
+                _mean(declared.l95_ms[first:last]),
                 _mean(windows.missed) / _mean(windows.counted),
-                _mean(self.declared.violation_rate[name][first:last]),
+                _mean(declared.violation_rate[first:last]),
                 _mean(windows.uncut_ms),
                 *_mean_shares(windows.shares[:, 1]),
             )
             terms = (
                 _mean(windows.age_ms),
-                _mean(self.declared.age_ms[name][first:last]),
+                _mean(declared.age_ms[first:last]),
                 _mean(windows.price_per_hour),
-                _mean(self.declared.price_per_hour[name][first:last]),
+                _mean(declared.price_per_hour[first:last]),
             )
             cycles, tables = slice(first * self._window, twin.cursor), twin.arrays.tables
             latency_ns = tables.latency_ns[0, cycles].copy()
@@ -290,8 +291,7 @@ class StepwisePlayer:
 
     def _age(self, name: str, known: tuple[float, float]) -> tuple[float, float]:
         """Return the mean age of a candidate and its error, ms."""
-        steps = self._twins[name].terms
-        usual = float(self.declared.age_ms[name][1:].std()) / math.sqrt(self._step)
+        steps, usual = self._twins[name].terms, self._usual[name][2]
         age_ms, error_ms, _ = _estimated(steps.sums()[0], len(steps), *known, usual=usual)
         return min(age_ms, self._censor_ms), error_ms
 
@@ -299,8 +299,7 @@ class StepwisePlayer:
         """Return the price of a candidate's bytes, money per hour, if links have prices."""
         if known is None:
             return None
-        steps = self._twins[name].terms
-        usual = float(self.declared.price_per_hour[name][1:].std()) / math.sqrt(self._step)
+        steps, usual = self._twins[name].terms, self._usual[name][3]
         return _estimated(steps.sums()[1], len(steps), known, 0.0, usual=usual)[0]
 
     def _share_over(self, name: str) -> float | None:
