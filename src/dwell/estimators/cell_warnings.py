@@ -301,10 +301,10 @@ def _crossings(problem: Problem, placement: Copy) -> Iterator[tuple[Flow, Link]]
 def _full_links(problem: Problem, placement: Copy) -> Iterator[str]:
     """Yield links that get more data than their rate allows, including repeated messages."""
     sent_bytes = dict.fromkeys(problem.fabric.links, 0.0)
+    every = problem.pipeline.message_rates
     for flow, link in _crossings(problem, placement):
         attempts = 1 if link.retransmit_ms is None else 1 / (1 - link.loss)
-        rate = problem.pipeline.message_rate(flow)
-        sent_bytes[link.name] += attempts * flow.payload_bytes / rate
+        sent_bytes[link.name] += attempts * flow.payload_bytes / every[flow.source, flow.target]
     for name, link in problem.fabric.links.items():
         mbps = 8e-3 * sent_bytes[name] / problem.pipeline.period_ms
         if mbps > link.rate_mbps:

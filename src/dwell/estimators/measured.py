@@ -110,13 +110,11 @@ def message_columns(problem: Problem, placement: Placement) -> list[Message | No
 
 def patience_of(problem: Problem, parts: Iterable[Part]) -> list[int]:
     """Return the patience with each part (see `patience_ns`), nanoseconds."""
-    pipeline, rates = problem.pipeline, problem.pipeline.rates
-    of_flows = {(flow.source, flow.target): pipeline.message_rate(flow) for flow in pipeline.flows}
-    every = (
-        of_flows[part.source, part.target] if isinstance(part, Message) else rates[part.task]
+    rates, every = problem.pipeline.rates, problem.pipeline.message_rates
+    return [
+        patience_ns(problem, every[part[:2]] if isinstance(part, Message) else rates[part.task])
         for part in parts
-    )
-    return [patience_ns(problem, rate) for rate in every]
+    ]
 
 
 class Meter:

@@ -44,7 +44,8 @@ class PresentTables:
         self.changes = tables.changes[own & (tables.changes["at_ns"] < LAST_NS)]
         self._declared_changes = self.changes
         self._nothing_ns = np.zeros(real.cycles, np.int64)
-        hops, rates = list(enumerate(real.hops, part.hop_0)), _rates(problem)
+        hops = list(enumerate(real.hops, part.hop_0))
+        rates, every = problem.pipeline.rates, problem.pipeline.message_rates
         #: Extra delays of each message, and of its shadows.
         self._layers = {
             Message(*hop): tables.layers[row :: len(hops) + len(real.forwards)][: part.rows]
@@ -67,7 +68,7 @@ class PresentTables:
             # The rows of forwards come after.
             for hop, row in zip(played.hops, played.delay_ns, strict=False):
                 of_hop = self._rows.setdefault(Message(*hop), [])
-                of_hop.append(TimesRow.of(row, rates.get(hop[:2], 1)))
+                of_hop.append(TimesRow.of(row, every.get(hop[:2], 1)))
         self._stretched: dict[Part, float] = {
             Site(*site): _stretched(problem, Site(*site)) for site in real.sites
         }
@@ -117,15 +118,6 @@ class PresentTables:
                 # Delays include lost attempts. A link that loses half its messages is down.
                 self._rates[link]["loss"] = 0.0
                 self._segments[link]["is_down"] = share >= 0.5
-
-
-def _rates(problem: Problem) -> dict[str | tuple[str, str], int]:
-    """Return the cycles from one run of each task to its next, and the same for messages."""
-    pipeline = problem.pipeline
-    rates: dict[str | tuple[str, str], int] = dict(pipeline.rates.items())
-    for flow in pipeline.flows:
-        rates[flow.source, flow.target] = pipeline.message_rate(flow)
-    return rates
 
 
 def _stretched(problem: Problem, site: Site) -> float:

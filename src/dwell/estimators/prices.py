@@ -278,7 +278,7 @@ def most_windows(problem: Problem, cycles: int | None = None) -> int:
     pipeline, width = problem.pipeline, problem.window_cycles
     events = 1 + len(pipeline.tasks) + len(pipeline.flows)
     if pipeline.has_rates:
-        rates = *pipeline.rates.values(), *map(pipeline.message_rate, pipeline.flows)
+        rates = *pipeline.rates.values(), *pipeline.message_rates.values()
         events = math.ceil(1 + sum(1 / every for every in rates))
     most = min(MOST_CYCLES * pipeline.due_interval, MOST_EVENTS // events) // width
     if cycles is not None:

@@ -38,7 +38,7 @@ from dwell.estimators.evidence import NOT_DUE, Evidence
 from dwell.estimators.learning import Learning
 from dwell.estimators.measured import Message, Part, Site, cores_of, message_of, sending_ns
 from dwell.estimators.paths import longest_path, steps_of
-from dwell.estimators.spans import NS_PER_MS, flow_patience_ns, spans_ms
+from dwell.estimators.spans import NS_PER_MS, patience_ns, spans_ms
 from dwell.model.bounds import VALUE, shown
 from dwell.model.number_arrays import Floats
 from dwell.model.order_statistic import percentile
@@ -89,7 +89,8 @@ class Scaling(Learning):
         self._steps = steps_of(problem.pipeline)
         names = list(problem.pipeline.tasks)
         self._sources = [names.index(flow.source) for flow in problem.pipeline.flows]
-        self._message_patience_ns = flow_patience_ns(problem)
+        every = problem.pipeline.message_rates.values()
+        self._message_patience_ns = np.array([patience_ns(problem, rate) for rate in every])
         rates = problem.pipeline.sink_rates
         #: Tasks on waited ways to a sink; the latency of a cycle does not depend on the others.
         self._on_path = {name for name in names if rates[name]}

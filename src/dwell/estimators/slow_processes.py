@@ -241,11 +241,11 @@ def processes_of(
     to the next; for links, of the slowest flow.
     """
     pipeline, fabric = problem.pipeline, problem.fabric
-    rates, sent = pipeline.rates, dict.fromkeys(fabric.links, 1)
+    rates, every, sent = pipeline.rates, pipeline.message_rates, dict.fromkeys(fabric.links, 1)
     placements = [copy for one in problem.candidates.values() for copy in one.copies]
     for flow, placement in itertools.product(pipeline.flows, placements):
         crossed = f"{placement[flow.source]}->{placement[flow.target]}"
-        sent[crossed] = max(sent.get(crossed, 1), pipeline.message_rate(flow))
+        sent[crossed] = max(sent.get(crossed, 1), every[flow.source, flow.target])
     yield frozenset(fabric.nodes), pipeline.release_jitter_ms, 1
     for name, scale in pipeline.scales.items():
         scaled = [task.on for task in pipeline.tasks.values() if task.scale == name]

@@ -29,12 +29,6 @@ def task_patience_ns(problem: Problem) -> Ints:
     return np.array([patience_ns(problem, rates[name]) for name in columns], np.int64)
 
 
-def flow_patience_ns(problem: Problem) -> Ints:
-    """Return the patience with the messages of each flow (see `patience_ns`)."""
-    rates = map(problem.pipeline.message_rate, problem.pipeline.flows)
-    return np.array([patience_ns(problem, rate) for rate in rates], np.int64)
-
-
 def spans_ms(begin_ns: Ints, end_ns: Ints, limit_ns: Ints | int) -> Floats:
     """Return the durations between instants, milliseconds.
 

@@ -526,7 +526,7 @@ class _Layout:
 
     def _add_pipeline(self, pipeline: Pipeline, flows: Sequence[Flow], copy: int) -> None:
         """Add a copy of the tasks of a cell, and of its flows in the order of `ordered_flows`."""
-        names = list(pipeline.tasks)
+        names, every = list(pipeline.tasks), pipeline.message_rates
         flow_row = {
             (flow.source, flow.target): i for i, flow in enumerate(flows, copy * len(flows))
         }
@@ -535,7 +535,7 @@ class _Layout:
                 "source": copy * len(names) + names.index(flow.source),
                 "target": copy * len(names) + names.index(flow.target),
                 "is_sampled": flow.sampled,
-                "every": pipeline.message_rate(flow),
+                "every": every[flow.source, flow.target],
             }
             for flow in flows
         ]

@@ -317,10 +317,10 @@ class Drawing:
             *((hop[2], "", _hop_name(hop)) for hop in self.hops),
             *((hop[2], "forward/", _hop_name(hop)) for hop in self.forwards),
         ]
-        rates = problem.pipeline.rates
-        #: Cycles from one value of each row to its next; all other values are 0.
+        rates, every = problem.pipeline.rates, problem.pipeline.message_rates
+        #: Cycles from one value of each row to its next, 1 for states; all other values are 0.
         self.site_rates = [rates[task] for task, _ in self.sites]
-        self.hop_rates = _hop_rates(problem, (*self.hops, *self.forwards))
+        self.hop_rates = [every.get(hop[:2], 1) for hop in (*self.hops, *self.forwards)]
         self.paths: dict[str, Path] = {}
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
@@ -725,10 +725,3 @@ def _over(
     for link in problem.fabric.links.values():
         if (link.source, link.target) in ends:
             yield source, target, link.name
-
-
-def _hop_rates(problem: Problem, hops: Sequence[Hop]) -> list[int]:
-    """Return the cycles from one message of each hop to its next; 1 for states."""
-    pipeline = problem.pipeline
-    rates = {(one.source, one.target): pipeline.message_rate(one) for one in pipeline.flows}
-    return [rates.get((source, target), 1) for source, target, _ in hops]

@@ -310,13 +310,18 @@ class Pipeline:
             if name == chain.target or chain.target in behind(name, self.flows)
         )
 
-    def message_rate(self, flow: Flow) -> int:
-        """Cycles from one message of a flow to its next.
+    @property
+    def message_rates(self) -> dict[tuple[str, str], int]:
+        """Cycles from one message of each flow to its next, by source and target.
 
         A waited flow has messages in the cycles in which its target runs, a sampled flow in the
         cycles in which its source runs.
         """
-        return self.rates[flow.source if flow.sampled else flow.target]
+        rates = self.rates
+        return {
+            (one.source, one.target): rates[one.source if one.sampled else one.target]
+            for one in self.flows
+        }
 
     def diverging(self, active: Mapping[str, Nodes], other: Mapping[str, str]) -> frozenset[str]:
         """Return the tasks on another node under `other`, and all tasks downstream of them.

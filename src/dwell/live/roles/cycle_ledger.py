@@ -726,7 +726,7 @@ class Ledger:
             return
         numbers = np.array([cycle.number for cycle in cycles], np.int64)
         of_tasks = np.array([self.due.rates[name] for name in self._tasks])
-        of_flows = np.array([self._pipeline.message_rate(flow) for flow in self._pipeline.flows])
+        of_flows = np.array([*self._pipeline.message_rates.values()])
         for name, instants in known.items():
             rates = of_flows if name == "arrived_ns" else of_tasks
             instants[numbers[:, None] % rates != 0] = NOT_DUE

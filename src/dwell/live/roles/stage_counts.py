@@ -192,9 +192,8 @@ class StageTable:
         self._rates = problem.pipeline.rates
         # Jobs of the source per message of a flow.
         self._jobs_per_message = {
-            (flow.source, flow.target): problem.pipeline.message_rate(flow)
-            // self._rates[flow.source]
-            for flow in problem.pipeline.flows
+            (source, target): every // self._rates[source]
+            for (source, target), every in problem.pipeline.message_rates.items()
         }
         #: Time after the report of a sent message until the message counts as lost if it has not
         #: arrived: D, plus the time until the receiver's next report.
