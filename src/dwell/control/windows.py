@@ -103,9 +103,15 @@ def seen_l95_ms(latency_ns: Ints, age_ns: Ints, censor_ms: float) -> tuple[Float
     return l95_ms, uncut_ms
 
 
-def final_l95_ms(latency_ns: Ints) -> Floats:
-    """Return L95 (ms) of final latencies, shape (..., W); infinite if too many never completed."""
-    l95 = order_statistic(latency_ns, 95)
+def final_l95_ms(latency_ns: Ints, counts: Ints | None = None) -> Floats:
+    """Return L95 (ms) of final latencies, shape (..., W); infinite if too many never completed.
+
+    `counts` has the number of cycles of each window that are not idle, shape (windows,).
+    """
+    if counts is None:
+        l95 = order_statistic(latency_ns, 95)
+    else:
+        l95 = order_statistic_of_smallest(latency_ns, 95, counts)
     ms: Floats = np.where(l95 >= NEVER_NS, np.inf, l95 / 1e6)
     return ms
 

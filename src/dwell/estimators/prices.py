@@ -37,7 +37,7 @@ from dwell.model.frozen import FrozenDict
 from dwell.model.instants import NEVER_NS, longest_run
 from dwell.model.number_arrays import Floats, Ints
 from dwell.model.objective import MissCap
-from dwell.model.order_statistic import order_statistic
+from dwell.model.order_statistic import order_statistic_of_smallest
 from dwell.model.pipeline import Pipeline
 from dwell.model.placement import Placement
 from dwell.model.problem import Problem
@@ -361,7 +361,7 @@ def _uncut(
     age_ms = (realisation.release_ns[-1] - realisation.release_ns[-1 - len(outcome) : -1]) / 1e6
     is_young = (outcome == CycleOutcome.IN_FLIGHT) & (age_ms <= max(problem.censor_ms, usual_ms))
     lost = int(np.count_nonzero(~done & ~is_young & ~is_idle))
-    uncut_ms, is_lost = _known_later(latency_ns, is_idle, windows.l95_ms)
+    uncut_ms, is_lost = _known_later(latency_ns, windows)
     open_windows = is_young.reshape(len(uncut_ms), -1).any(axis=1)
     if not open_windows.all():
         uncut_ms, is_lost = uncut_ms[~open_windows], is_lost[~open_windows]
@@ -434,19 +434,15 @@ def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
 
 
 def _known_later(
-    latency_ns: Ints, is_idle: NDArray[np.bool_], seen_ms: Floats
+    latency_ns: Ints, windows: PlayedWindows
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Return L95 of every window by the final latencies, milliseconds, and whether it is lost.
 
     L95 of a lost window is its value at the end of the window. `latency_ns` has `NEVER_NS` for
     cycles that did not complete; idle cycles do not count.
     """
-    windows = latency_ns.reshape(len(seen_ms), -1)
-    if is_idle.any():
-        idle = is_idle.reshape(windows.shape)
-        each = [order_statistic(one[~off], 95) for one, off in zip(windows, idle, strict=True)]
-        l95_ns = np.array(each)
-    else:
-        l95_ns = order_statistic(windows, 95)
+    seen_ms = windows.l95_ms
+    by_window = latency_ns.reshape(len(seen_ms), -1)
+    l95_ns = order_statistic_of_smallest(by_window, 95, windows.counted)
     is_lost = l95_ns >= NEVER_NS
     return np.where(is_lost, seen_ms, np.maximum(l95_ns / 1e6, seen_ms)), is_lost

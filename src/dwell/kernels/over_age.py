@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,33 +33,46 @@ def over_age(
         Only actuations until this instant count, as at the close of each cycle's window.
     """
     over = np.zeros(len(release_ns[cycles]), np.bool_)
-    for number, chain in enumerate(pipeline.chains.values()):
-        if chain.is_bounded:
-            at_ns = arrays.tables.actuated_ns[0, number, cycles]
-            age_ns = at_ns - release_ns[arrays.tables.actuated_from[0, number, cycles]]
-            over |= (at_ns <= by_ns) & (age_ns > chain.max_age_ns)
+    for one, _ in _over_bounds(pipeline, release_ns, arrays, cycles, by_ns):
+        over |= one
     return over
 
 
 def stale_origins(pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice) -> Ints:
     """Return the origin of each actuation in some cycles whose age is over its chain's bound."""
-    found = [np.empty(0, np.int64)]
+    found = _over_bounds(pipeline, release_ns, arrays, cycles, NEVER_NS - 1)
+    return np.concatenate([np.empty(0, np.int64), *(origins[over] for over, origins in found)])
+
+
+def _over_bounds(
+    pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice, by_ns: Ints | int
+) -> Iterator[tuple[NDArray[np.bool_], Ints]]:
+    """Yield whether each age is over the bound of a chain, and the origins, for each bound."""
     for number, chain in enumerate(pipeline.chains.values()):
         if chain.is_bounded:
             at_ns = arrays.tables.actuated_ns[0, number, cycles]
-            origin = arrays.tables.actuated_from[0, number, cycles].astype(np.int64)
-            found.append(
-                origin[(at_ns < NEVER_NS) & (at_ns - release_ns[origin] > chain.max_age_ns)]
-            )
-    return np.concatenate(found)
+            origins = arrays.tables.actuated_from[0, number, cycles]
+            yield (at_ns <= by_ns) & (at_ns - release_ns[origins] > chain.max_age_ns), origins
+
+
+def misses(
+    pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice
+) -> NDArray[np.bool_]:
+    """Return whether each of some cycles is late or its data are too old; idle cycles are not."""
+    missed = arrays.tables.latency_ns[0, cycles] > pipeline.deadline_ns
+    missed |= over_age(pipeline, release_ns, arrays, cycles)
+    missed &= _is_due(arrays, cycles)
+    return missed
 
 
 def due_misses(
     pipeline: Pipeline, release_ns: Ints, arrays: CellArrays, cycles: slice
 ) -> NDArray[np.bool_]:
     """Return whether each cycle is late or its data are too old, without idle cycles."""
-    tables = arrays.tables
-    missed = tables.latency_ns[0, cycles] > pipeline.deadline_ns
-    missed |= over_age(pipeline, release_ns, arrays, cycles)
-    due: NDArray[np.bool_] = missed[tables.outcome[0, cycles] != CycleOutcome.IDLE]
+    return misses(pipeline, release_ns, arrays, cycles)[_is_due(arrays, cycles)]
+
+
+def _is_due(arrays: CellArrays, cycles: slice) -> NDArray[np.bool_]:
+    """Return whether a sink is due in each of some cycles."""
+    due: NDArray[np.bool_] = arrays.tables.outcome[0, cycles] != CycleOutcome.IDLE
     return due

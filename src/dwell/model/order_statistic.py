@@ -26,9 +26,9 @@ def order_statistic_of_smallest(
     values: NDArray[Number], percent: int, counts: NDArray[np.int64]
 ) -> NDArray[Number]:
     """Return the percentile of the `counts` smallest values of each row; of none, the smallest."""
-    rank = np.maximum(rank_of(percent, counts), 1)
-    ordered = np.sort(values, axis=1)
-    return np.take_along_axis(ordered, rank[:, None] - 1, axis=1)[:, 0]
+    place = np.maximum(rank_of(percent, counts), 1) - 1
+    ordered = np.partition(values, np.unique(place), axis=1)
+    return np.take_along_axis(ordered, place[:, None], axis=1)[:, 0]
 
 
 def percentile(values: NDArray[Number], percent: int) -> float:

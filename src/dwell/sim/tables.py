@@ -151,19 +151,10 @@ class PlayedRealisation:
         release_ns, beyond = self.realisation.release_ns, self.first + self.problem.window_cycles
         return window_close_ns(self.problem, release_ns[beyond - 1], release_ns[beyond])
 
-    @cached_property
-    def idle(self) -> NDArray[np.bool_] | None:
-        """Whether no sink is due in each cycle; None if a sink is due in all."""
-        if not self.problem.pipeline.has_idle_cycles:
-            return None
-        idle: NDArray[np.bool_] = self.arrays.tables.outcome[0] == CycleOutcome.IDLE
-        return idle
-
     def share_of(self, cycles: NDArray[np.bool_]) -> Floats:
         """Return the share of each window's cycles that are true, without idle cycles."""
-        windows = self.by_window(cycles)
-        share: Floats = windows.mean(axis=1)
-        return share if self.idle is None else windows.sum(axis=1) / self.seen["counted"]
+        share: Floats = self.by_window(cycles).sum(axis=1) / self.seen["counted"]
+        return share
 
     @cached_property
     def overtaken(self) -> NDArray[np.bool_]:
@@ -174,32 +165,25 @@ class PlayedRealisation:
     @cached_property
     def missed(self) -> NDArray[np.bool_]:
         """Whether each cycle missed: late, unfinished when its window closed, or its data old."""
-        latency_ns = self.arrays.tables.latency_ns[0, : self.released]
-        missed: NDArray[np.bool_] = latency_ns > self.problem.pipeline.deadline_ns
-        missed |= self._over_age
+        tables, cycles = self.arrays.tables, slice(self.released)
+        pipeline, release_ns = self.problem.pipeline, self.realisation.release_ns
+        latency_ns, close_ns = tables.latency_ns[0, cycles], self._close_ns_of_cycles
+        missed: NDArray[np.bool_] = latency_ns > pipeline.deadline_ns
+        missed |= latency_ns > close_ns - release_ns[cycles]
+        missed |= over_age(pipeline, release_ns, self.arrays, cycles, close_ns)
+        missed &= tables.outcome[0, cycles] != CycleOutcome.IDLE
         if not self.realisation.is_cut(self.problem):
             # The windows of the last cycles never closed.
             missed[self.counted :] = False
-        age_ns = self.close_ns[:, None] - self.by_window(self.realisation.release_ns)
-        late = self.by_window(latency_ns) > age_ns
-        if self.whole:
-            missed[: self.counted] |= late.ravel()
-        else:
-            window, place = late.nonzero()
-            missed[self.first[window] + place] = True
-        if self.idle is not None:
-            missed &= ~self.idle[: self.released]
         return missed
 
     @property
-    def _over_age(self) -> NDArray[np.bool_]:
-        """Whether the data of each cycle's actuations were too old, as known at its close."""
+    def _close_ns_of_cycles(self) -> Ints:
+        """Instant at which the window of each cycle closes; a late instant without a window."""
         close_ns = np.full(self.released, NEVER_NS - 1)
-        close_ns[self.first[:, None] + np.arange(self.problem.window_cycles)] = self.close_ns[
-            :, None
-        ]
-        played = self.problem.pipeline, self.realisation.release_ns, self.arrays
-        return over_age(*played, slice(self.released), close_ns)
+        windows = self.first[:, None] + np.arange(self.problem.window_cycles)
+        close_ns[windows] = self.close_ns[:, None]
+        return close_ns
 
 
 def make_tables(
@@ -296,7 +280,9 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             "warmup": np.arange(count) < problem.warmup_windows,
             "placement": Names(stamps[played.first], tuple(problem.candidates)),
             "mixed": mixed,
-            "l95_ms": lambda: _final_l95_ms(played),
+            "l95_ms": lambda: final_l95_ms(
+                played.by_window(played.arrays.tables.latency_ns[0]), played.seen["counted"]
+            ),
             "violation_rate": lambda: played.share_of(played.missed),
             "seen_l95_ms": seen["l95_ms"],
             "seen_violation_rate": seen["violation_rate"],
@@ -309,15 +295,6 @@ def _windows(played: PlayedRealisation, seen: dict[str, Floats]) -> TableArrays:
             **_shadow_columns(played),
         }
     )
-
-
-def _final_l95_ms(played: PlayedRealisation) -> Floats:
-    """Return L95 of every window by the final latencies, without idle cycles."""
-    latency_ns = played.by_window(played.arrays.tables.latency_ns[0])
-    if played.idle is None:
-        return final_l95_ms(latency_ns)
-    rows = zip(latency_ns, played.by_window(played.idle), strict=True)
-    return np.array([final_l95_ms(latency[~idle]) for latency, idle in rows])
 
 
 def _age_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray[np.generic]]]:

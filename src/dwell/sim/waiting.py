@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dwell.kernels.arrays import CellArrays, flow_columns
-from dwell.kernels.codes import CycleOutcome
-from dwell.kernels.over_age import over_age, stale_origins
+from dwell.kernels.over_age import misses, stale_origins
 from dwell.kernels.realisation import LinkSegments, Realisation
 from dwell.model import Problem
 from dwell.model.number_arrays import Ints
@@ -31,12 +30,9 @@ def waiting_of(problem: Problem, real: Realisation, arrays: CellArrays) -> Waiti
     """
     tables, pipeline = arrays.tables, problem.pipeline
     first, last = problem.warmup_windows * problem.window_cycles, real.cycles
-    missed = tables.latency_ns[0, :last] > pipeline.deadline_ns
-    missed |= over_age(pipeline, real.release_ns, arrays, slice(last))
-    missed &= tables.outcome[0, :last] != CycleOutcome.IDLE
+    counted = pipeline, real.release_ns, arrays, slice(first, last)
     # Old data waited in the cycle that they descend from.
-    origins = stale_origins(pipeline, real.release_ns, arrays, slice(first, last))
-    cycles = np.concatenate((first + np.flatnonzero(missed[first:]), origins))
+    cycles = np.concatenate((first + np.flatnonzero(misses(*counted)), stale_origins(*counted)))
     logs, _, arrivals, _ = arrays.logs()
     log, arrived = logs[0, cycles], arrivals[0, cycles][:, flow_columns(problem)]
     stamps = tables.stamps[0, cycles]
