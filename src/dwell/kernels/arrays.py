@@ -23,7 +23,7 @@ from dwell.kernels.codes import (
 )
 from dwell.kernels.realisation import LinkSegments, NodeChanges, Phase, Realisation
 from dwell.kernels.rows import Rows, Tables, row_types
-from dwell.model import Flow, Node, Pipeline, Placement, Problem, Quota, Replicas
+from dwell.model import Flow, Node, Pipeline, Placement, Problem, Replicas
 from dwell.model.instants import NEVER_NS
 from dwell.model.number_arrays import Ints
 from dwell.model.placement import Copy
@@ -40,6 +40,9 @@ BUDGET = 200_000
 DRAWN_MS, LEAST_MS = 5.0, 1.4
 #: Number of shares of a resource: busy, own, of shadows, of other cells.
 PARTS = 4
+#: Tables with one plain value per row, and tables with one per task.
+LISTS = ("outputs", "sampled", "sink_rates", "cell_servers", "capacity", "back_ns", "after_ns")
+BY_TASK = ("site_of", "hear_ns", "shadow_parts")
 #: Alignment in bytes of the tables of a state in one block of memory.
 LINE = 64
 
@@ -202,16 +205,10 @@ class Arrays:
             return moved.reshape(2 * len(table), *table.shape[1:])
 
         clock["n_slots"] = 2 * n_slots
-        rings: dict[str, NDArray[Any]] = {
-            "slots": t.slots,
-            "jobs": t.jobs,
-            "attempts": t.attempts,
-        }
-        if len(t.log) and not clock["logs_all"]:
-            rings |= {"log": t.log, "log_outcome": t.log_outcome, "log_arrived": t.log_arrived}
-            if len(t.log_taken):
-                rings["log_taken"] = t.log_taken
-        self._use(t._replace(**{name: larger(table) for name, table in rings.items()}))
+        names = ["slots", "jobs", "attempts"]
+        if not clock["logs_all"]:
+            names += ["log", "log_outcome", "log_arrived", "log_taken"]
+        self._use(t._replace(**{name: larger(getattr(t, name)) for name in names}))
 
 
 #: Tables with rows by cell.
@@ -347,22 +344,13 @@ class _Layout:
         }
         self.behind: list[Ints] = []
         self.end_ns = 0
-        self.outputs: list[int] = []
-        self.sampled: list[int] = []
-        self.sink_rates: list[int] = []
-        self.cell_servers: list[int] = []
-        self.capacity: list[float] = []
+        #: Tables of plain values, row after row.
+        self.lists: dict[str, list[Any]] = {name: [] for name in (*LISTS, *BY_TASK, "route")}
         self.layers: list[dict[int, int]] = []
         self.parts: list[CellPart] = []
         self.segments: list[Rows] = []
         self.rates: list[Rows] = []
         self.n_segments = 0
-        self.site_of: list[list[int]] = []
-        self.route: list[list[int]] = []
-        self.back_ns: list[int] = []
-        self.after_ns: list[int] = []
-        self.hear_ns: list[list[int]] = []
-        self.shadow_parts: list[list[ShadowPart]] = []
         self.changes: list[Rows] = []
 
     def arrays(self) -> Arrays:
@@ -389,7 +377,7 @@ class _Layout:
             windows=real.windows,
             tasks=len(problem.pipeline.tasks),
             resources=len(problem.fabric.resources),
-            candidate_0=len(self.site_of),
+            candidate_0=len(self.lists["back_ns"]),
             candidates=len(problem.candidates),
             hop_0=len(self.rows["hops"]),
             site_0=len(self.rows["sites"]),
@@ -431,15 +419,18 @@ class _Layout:
         if quota is None:
             return
         cpu["quota"] = len(self.rows["quotas"])
-        counted = _counted_ns(node, quota)
         ticks = scheduler == Scheduler.TURNS
-        pooled = counted["slack_ns"] or ticks
+        quota_ns, slack_ns = max(round(node.budget_ms * 1e6), 1), round(quota.slack_ms * 1e6)
         new: dict[str, Any] = {
-            **counted,
+            "quota_ns": quota_ns,
+            "stressed_ns": max(round(node.stressed_budget_ms * 1e6), 1),
+            "slack_ns": slack_ns,
+            "least_ns": round(LEAST_MS * 1e6),
+            "drawn_ns": round(DRAWN_MS * 1e6),
             "looks_ns": -1,
             "period_ns": round(quota.period_ms * 1e6),
             "tick_ns": round(quota.tick_ms * 1e6),
-            "pool_ns" if pooled else "left_ns": counted["quota_ns"],
+            "pool_ns" if slack_ns or ticks else "left_ns": quota_ns,
         }
         if ticks:
             hz = node.background_hz
@@ -499,14 +490,14 @@ class _Layout:
             "candidate_0": part.candidate_0,
             "n_candidates": part.candidates,
             "n_sinks": len(pipeline.sinks),
-            "sampled_0": len(self.sampled),
+            "sampled_0": len(self.lists["sampled"]),
             "n_sampled": sum(flow.sampled for flow in flows),
             "forward_0": len(self.rows["forwards"]),
             "n_forwards": len(real.forwards),
             "period_ns": pipeline.period_ns,
             "given_up_after": problem.window_cycles + GIVEN_UP_AFTER,
-            "pair_0": len(self.shadow_parts),
-            "resource_0": len(self.cell_servers),
+            "pair_0": len(self.lists["shadow_parts"]),
+            "resource_0": len(self.lists["cell_servers"]),
             "n_resources": part.resources,
             "n_flows": len(flows),
             "chain_0": len(self.rows["chains"]),
@@ -517,10 +508,10 @@ class _Layout:
             "parent": -1,
         }
         self.rows["cells"].append(cell)
-        self.cell_servers += [
+        self.lists["cell_servers"] += [
             self.server_row[self.node_row[index, one.node], one.kind or None] for one in resources
         ]
-        self.capacity += [one.capacity for one in resources]
+        self.lists["capacity"] += [one.capacity for one in resources]
         for copy in range(_copies(problem)):
             self._add_pipeline(pipeline, flows, copy)
 
@@ -539,7 +530,7 @@ class _Layout:
             }
             for flow in flows
         ]
-        self.sampled += [
+        self.lists["sampled"] += [
             flow_row[flow.source, flow.target] for flow in pipeline.flows if flow.sampled
         ]
         self.rows["chains"] += [
@@ -561,16 +552,16 @@ class _Layout:
                     "in_0": in_0,
                     "n_inputs": n_inputs,
                     "n_out": len(outputs),
-                    "out_0": len(self.outputs),
+                    "out_0": len(self.lists["outputs"]),
                     "offset_ns": round(task.offset_ms * 1e6),
                     "every": rates[name],
-                    "rate_0": len(self.sink_rates),
+                    "rate_0": len(self.lists["sink_rates"]),
                     "n_rates": len(needed_by[name]),
                 }
             )
             in_0 += n_inputs
-            self.outputs += outputs
-            self.sink_rates += needed_by[name]
+            self.lists["outputs"] += outputs
+            self.lists["sink_rates"] += needed_by[name]
 
     def _add_candidates(
         self,
@@ -599,14 +590,15 @@ class _Layout:
                     hop_row.get((f.source, f.target, f"{copy[f.source]}->{copy[f.target]}"), -1)
                     for f in ordered_flows(problem.pipeline)
                 ]
-            self.site_of.append(on + [-1] * (self.max_tasks - len(on)))
-            self.route.append(hop_of + [-1] * (self.max_flows - len(hop_of)))
-            self.back_ns.append(back_ns(problem, placement.first))
+            self.lists["site_of"].append(on + [-1] * (self.max_tasks - len(on)))
+            self.lists["route"].append(hop_of + [-1] * (self.max_flows - len(hop_of)))
+            self.lists["back_ns"].append(back_ns(problem, placement.first))
             self._add_hearing(problem, placement)
 
     def _add_hearing(self, problem: Problem, placement: Placement) -> None:
         """Add when second copies may be sent, and when nodes hear that a cycle is done."""
         hear: list[int] = []
+        after_ns = -1
         if isinstance(placement, Replicas):
             ways_ns, tasks = hear_ns(problem, placement), problem.pipeline.tasks
             nodes = [copy[name] for copy in placement.copies for name in tasks]
@@ -614,10 +606,9 @@ class _Layout:
             hear = [
                 ways_ns[node] if node not in nodes[:row] else -1 for row, node in enumerate(nodes)
             ]
-            self.after_ns.append(round(placement.after_ms * 1e6))
-        else:
-            self.after_ns.append(-1)
-        self.hear_ns.append(hear + [-1] * (self.max_tasks - len(hear)))
+            after_ns = round(placement.after_ms * 1e6)
+        self.lists["after_ns"].append(after_ns)
+        self.lists["hear_ns"].append(hear + [-1] * (self.max_tasks - len(hear)))
 
     def _add_forwards(
         self,
@@ -645,7 +636,7 @@ class _Layout:
             parts = shadow_parts(problem.pipeline, active, other.first)
             # No shadow shares the jobs of second copies.
             parts += [ShadowPart.DISCARDED] * (self.max_tasks - len(parts))
-            self.shadow_parts.append(parts)
+            self.lists["shadow_parts"].append(parts)
 
     def _add_shadow(
         self, index: int, problem: Problem, real: Realisation, link_row: Mapping[str, int]
@@ -654,7 +645,7 @@ class _Layout:
         cells, part = self.rows["cells"], self.parts[index]
         cells[part.row]["shadow"] = len(cells)
         # A shadow has no windows.
-        shadow = {"candidate_0": len(self.site_of), "close_cycle": real.cycles + 1}
+        shadow = {"candidate_0": len(self.lists["back_ns"]), "close_cycle": real.cycles + 1}
         shadow["decide_cycles"] = shadow["n_chains"] = 0
         cells.append(cells[part.row] | shadow | {"shadow": -1, "parent": part.row})
         self.parts[index] = part._replace(rows=2)
@@ -778,21 +769,19 @@ class _Layout:
         return hop_0
 
     def _check_keys(self) -> None:
+        # Forwards of sampled flows are numbered after all flows.
+        messages = self.max_flows + max(len(real.forwards) for _, real in self.cells)
         limits = (
             ("cells", len(self.rows["cells"]), codes.CELL_MASK),
             ("tasks of a cell", self.max_tasks, codes.ITEM_MASK),
             ("flows of a cell", self.max_flows, codes.MOST_FLOWS),
-            ("flows and forwards of a cell", self._most_messages(), codes.MOST_FLOWS),
+            ("flows and forwards of a cell", messages, codes.MOST_FLOWS),
             ("feasible (task, node) pairs", len(self.rows["sites"]), codes.ITEM_MASK),
             ("nodes and accelerators", len(self.rows["servers"]), codes.ITEM_MASK - 1),
         )
         for what, number, limit in limits:
             if number > limit:
                 raise SimulationError(f"{number} {what} are more than the simulator's {limit}")
-
-    def _most_messages(self) -> int:
-        """Largest number of flows of a cell, and of forwards of its sampled flows."""
-        return self.max_flows + max(len(real.forwards) for _, real in self.cells)
 
     def _foreign(self, server: Mapping[str, Any], changes: Rows) -> int:
         """Largest number of a server's foreign threads that take turns; 0 without turns."""
@@ -880,20 +869,14 @@ class _Layout:
             "paid": (cells * any(problem.fabric.has_prices for problem, _ in self.cells), cycles),
             "late_copies": (cells * any(problem.replicas for problem, _ in self.cells), cycles),
         }
-        lists: dict[str, list[Any]] = {
-            "outputs": self.outputs,
-            "sampled": self.sampled,
-            "sink_rates": self.sink_rates,
-            "cell_servers": self.cell_servers,
-            "capacity": self.capacity,
-            "site_of": self.site_of,
-            "back_ns": self.back_ns,
-            "after_ns": self.after_ns,
-        }
+        width = {"route": (self.max_flows,), **dict.fromkeys(BY_TASK, (self.max_tasks,))}
         tables: dict[str, NDArray[Any]] = {
             **{name: _table(name, of, room.get(name, 0)) for name, of in rows.items()},
             **{name: np.zeros(shape, types[name]) for name, shape in blank.items()},
-            **{name: np.array(values, types[name]) for name, values in lists.items()},
+            **{
+                name: np.array(values, types[name]).reshape(len(values), *width.get(name, ()))
+                for name, values in self.lists.items()
+            },
             "changes": changes,
             "latency_ns": np.full((cells, cycles), NEVER_NS),
             "actuated_ns": np.full((cells, chains, cycles), NEVER_NS),
@@ -902,10 +885,7 @@ class _Layout:
             "log_taken": np.full((logged if clock["has_rates"] else 0, self.max_flows), -1),
             "forwarded": np.full(len(rows["forwards"]), -1),
             "values": np.full((len(rows["sites"]) * clock["has_rates"], self.max_flows), -1),
-            "route": np.array(self.route, np.int32).reshape(len(self.route), self.max_flows),
-            "hear_ns": np.array(self.hear_ns, np.int64).reshape(-1, self.max_tasks),
-            "shadow_parts": np.array(self.shadow_parts, np.int8).reshape(-1, self.max_tasks),
-            "soonest_ns": np.full((len(self.site_of), self.max_tasks), -1),
+            "soonest_ns": np.full((len(self.lists["back_ns"]), self.max_tasks), -1),
         }
         tables["segments"] = np.concatenate([tables["segments"], *self.segments])
         tables["rates"] = np.concatenate([tables["rates"], *self.rates])
@@ -1032,17 +1012,6 @@ def shadow_parts(pipeline: Pipeline, active: Placement, other: Copy) -> list[Sha
         else ShadowPart.DISCARDED
         for name in pipeline.tasks
     ]
-
-
-def _counted_ns(node: Node, quota: Quota) -> dict[str, int]:
-    """Quota without and with foreign threads, slack, least turn, and the slice drawn at once."""
-    return {
-        "quota_ns": max(round(node.budget_ms * 1e6), 1),
-        "stressed_ns": max(round(node.stressed_budget_ms * 1e6), 1),
-        "slack_ns": round(quota.slack_ms * 1e6),
-        "least_ns": round(LEAST_MS * 1e6),
-        "drawn_ns": round(DRAWN_MS * 1e6),
-    }
 
 
 def _with_own_state(tables: Tables, first: Tables) -> tuple[NDArray[np.uint8], Tables]:
