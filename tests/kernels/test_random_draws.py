@@ -13,7 +13,7 @@ import pytest
 
 import dwell
 from dwell.errors import ProblemError
-from dwell.kernels.random_draws import Drawing, drawn_scenario
+from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import LinkSegment, NodeChange, Realisation
 from dwell.model import (
     Bursts,
@@ -283,7 +283,7 @@ def test_a_drawn_scenario_without_episodes_is_the_same_realisation(name: str) ->
     problem = dynamic_problem()
     seed, windows = 3, 120
     episodes = draw(problem, scenario=name, seed=seed, windows=windows)
-    plain = drawn_scenario(problem, scenario=name, seed=seed, windows=windows)
+    plain = Drawing(problem, name, seed=seed, windows=windows).episodes()
     assert all(item.episodes is None for item in plain)
     told = replace(problem, scenarios={**problem.scenarios, "plain": plain})
     again = draw(told, scenario="plain", seed=seed, windows=windows)

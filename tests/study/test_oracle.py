@@ -33,7 +33,7 @@ from dwell.model import (
     TraceTable,
     Uniform,
 )
-from dwell.sim import draw, drawn_scenario
+from dwell.sim import Drawing, draw
 from dwell.study import oracle
 from dwell.study.oracle import RAMP_PRICES, expected_costs, sets_of
 from dwell.study.reference import (
@@ -169,7 +169,7 @@ def test_each_cycle_has_the_set_that_was_drawn() -> None:
     problem = two_nodes(4.0, items)
     realisation = realise(problem, 80)
     sets, which = sets_of(problem, realisation)
-    drawn = drawn_scenario(problem, scenario="given", seed=1, windows=80)
+    drawn = Drawing(problem, "given", seed=1, windows=80).episodes()
     assert len(drawn) > 5
     for cycle, at_ns in enumerate(realisation.release_ns[:-1].tolist()):
         on = {item.place for item in drawn if item.at_s <= at_ns / 1e9 < item.end_s}

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 import dwell
-from dwell.kernels.random_draws import drawn_scenario
+from dwell.kernels.random_draws import Drawing
 from dwell_lab.testbed.inventory import load_inventory
 from dwell_lab.testbed.real_hosts import run_on_hosts
 from tests.cells.light import write_cell
@@ -60,7 +60,7 @@ def test_a_scenario_is_played_by_the_commands_of_an_inventory(
     told = ["5.0", "7.0", "12.0", "7.0", "off", "5.0", "off"]
     assert links.read_text().split() == told
     assert stress.read_text().split() == ["1", "2", "1"]
-    drawn = drawn_scenario(problem, scenario="some", seed=1, windows=12)
+    drawn = Drawing(problem, "some", seed=1, windows=12).episodes()
     expected = [item for item in drawn if item.at_s < SECONDS]
     played = dwell.open_run(folder).played or ()
     assert [item.place for item in played] == [item.place for item in expected]

@@ -11,7 +11,7 @@ import pytest
 import dwell
 from dwell.cellfile import from_document
 from dwell.errors import LiveError, PolicyError
-from dwell.kernels.random_draws import drawn_scenario
+from dwell.kernels.random_draws import Drawing
 from dwell.live.local.playing import Played
 from dwell.live.local.testbed import MARK
 from dwell.live.local.timeline import Timeline, timeline_of
@@ -89,7 +89,7 @@ def test_a_run_meets_what_a_simulation_of_its_seed_meets(tmp_path: Path) -> None
         name=own_name(),
     )
     run = open_run(folder)
-    drawn = drawn_scenario(cell, scenario="some", seed=1, windows=13)
+    drawn = Drawing(cell, "some", seed=1, windows=13).episodes()
     # What comes last may come too late on a machine that has a lot else to do.
     expected = [item for item in drawn if item.at_s < 10]
     assert len(expected) > len(items)

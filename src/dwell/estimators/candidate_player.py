@@ -139,8 +139,9 @@ class CandidatePlayer:
         """Return some windows of a cell, from `first` until before `last`."""
         part, tables, stretch = arrays.parts[index], arrays.tables, slice(first, last)
         seen = tables.seen[part.row, stretch]
-        columns = (seen[name] for name in PlayedWindows._fields[:-1])
-        return PlayedWindows(*columns, tables.shares[part.row, stretch, :, : part.resources])
+        columns = [seen[name] for name in PlayedWindows._fields[:-1]]
+        shares = tables.shares[part.row, stretch, :, : part.resources]
+        return PlayedWindows._make([*columns, shares])
 
 
 def _to_measure(problem: Problem, real: Realisation) -> Realisation:

@@ -107,7 +107,7 @@ def _drawn_as_declared(problem: Problem, seed: int, windows: int) -> Realisation
 def _shown(player: CandidatePlayer, names: Iterable[str]) -> dict[str, PlayedWindows]:
     """Return every window of candidates, copied from the tables of the simulation."""
     shown = {name: player.windows(player.play({0: name})) for name in names}
-    return {name: PlayedWindows(*map(np.copy, windows)) for name, windows in shown.items()}
+    return {name: PlayedWindows._make(map(np.copy, windows)) for name, windows in shown.items()}
 
 
 def _evidence_of(player: CandidatePlayer, name: str) -> Evidence:

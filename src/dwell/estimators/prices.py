@@ -433,9 +433,7 @@ def _by_resource(problem: Problem, shares: Floats) -> Mapping[str, float]:
     return FrozenDict(zip(problem.fabric.resources, shares.round(12).tolist(), strict=True))
 
 
-def _known_later(
-    latency_ns: Ints, windows: PlayedWindows
-) -> tuple[Floats, NDArray[np.bool_]]:
+def _known_later(latency_ns: Ints, windows: PlayedWindows) -> tuple[Floats, NDArray[np.bool_]]:
     """Return L95 of every window by the final latencies, milliseconds, and whether it is lost.
 
     L95 of a lost window is its value at the end of the window. `latency_ns` has `NEVER_NS` for

@@ -6,11 +6,11 @@ import hashlib
 import math
 import os
 import struct
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
 from itertools import product
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,46 +139,6 @@ def _require_memory(problem: Problem, windows: int) -> None:
         )
 
 
-def drawn_scenario(
-    problem: Problem,
-    *,
-    scenario: str,
-    seed: int,
-    windows: int,
-    streams: str = "",
-    shared: Collection[str] = (),
-    disturbances: Scenario = (),
-) -> Scenario:
-    """Return a scenario with its sampled episodes as disturbances (see `draw`).
-
-    Raises
-    ------
-    ProblemError
-        If the scenario does not exist.
-    TraceError
-        If the times of episodes come from a trace that is too short or missing.
-    """
-    return Drawing(
-        *(problem, scenario),
-        seed=seed,
-        windows=windows,
-        streams=streams,
-        shared=shared,
-        disturbances=disturbances,
-    ).episodes()
-
-
-def draw_changes(
-    problem: Problem, *, scenario: str, seed: int, windows: int
-) -> tuple[Scenario, NodeChanges, LinkSegments]:
-    """Sample only the changes of nodes and links of a realisation.
-
-    The first item is the scenario from `drawn_scenario`, which raises the same errors.
-    """
-    drawing = Drawing(problem, scenario, seed=seed, windows=windows)
-    return drawing.episodes(), *drawing.changes
-
-
 def draw_shadows(
     problem: Problem,
     realisation: Realisation,
@@ -203,15 +163,7 @@ def draw_shadows(
     """
 
     def drawing(sent: Ints | None) -> Drawing:
-        drawing = Drawing(
-            problem,
-            realisation.scenario,
-            seed=realisation.seed or 0,
-            windows=realisation.windows,
-            shadow=True,
-            wraps=wraps,
-            streams=realisation.streams,
-        )
+        drawing = Drawing.again(problem, realisation, shadow=True, wraps=wraps)
         drawing.sent = sent
         # Rows of traces depend on the releases of complete windows.
         if realisation.cycles == drawing.cycles:
@@ -325,6 +277,17 @@ class Drawing:
         self.rows: dict[int, tuple[TraceTable, Ints]] = {}
         self.release_ns = self._releases()
 
+    @classmethod
+    def again(cls, problem: Problem, realisation: Realisation, **more: Any) -> Drawing:
+        """Begin to sample a realisation again; `more` are further arguments."""
+        return cls(
+            *(problem, realisation.scenario),
+            seed=realisation.seed or 0,
+            windows=realisation.windows,
+            streams=realisation.streams,
+            **more,
+        )
+
     def take(self, windows: int) -> Realisation:
         """Sample the next windows; raise ValueError if fewer remain.
 
@@ -423,7 +386,13 @@ class Drawing:
         return self._node_changes(), self._link_segments()
 
     def episodes(self) -> Scenario:
-        """Return the scenario with one disturbance for each sampled episode."""
+        """Return the scenario with one disturbance for each sampled episode.
+
+        Raises
+        ------
+        TraceError
+            If the times of episodes come from a trace that is too short or missing.
+        """
         return tuple(one for item in self.scenario for one in self._episodes_of(item))
 
     def _phases(self) -> dict[str, Phase]:

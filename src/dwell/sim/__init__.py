@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from dwell.kernels.random_draws import draw, draw_changes, drawn_scenario
+from dwell.kernels.random_draws import Drawing as Drawing
+from dwell.kernels.random_draws import draw
 from dwell.kernels.realisation import LinkSegment, NodeChange, NodeChanges, Phase, Realisation
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ __all__ = [
     "Realisation",
     "describe",
     "draw",
-    "draw_changes",
-    "drawn_scenario",
     "simulate",
     "simulate_realisation",
 ]

@@ -161,15 +161,8 @@ def _result(
 
 def _released_at(fleet: Fleet, problem: Problem, real: Realisation) -> Realisation:
     """Return a realisation with another phase and the same jobs and messages; allows no traces."""
-    drawing = Drawing(
-        problem,
-        real.scenario,
-        seed=real.seed or 0,
-        windows=real.windows,
-        streams=real.streams,
-        shared=fleet.shared,
-        disturbances=fleet.disturbances,
-    )
+    shared = {"shared": fleet.shared, "disturbances": fleet.disturbances}
+    drawing = Drawing.again(problem, real, **shared)
     node_changes, link_segments = drawing.changes
     return replace(
         real,

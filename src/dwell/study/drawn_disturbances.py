@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dwell.errors import TraceError
 from dwell.model import Problem, Scenario
 from dwell.record import Run
-from dwell.sim import drawn_scenario
+from dwell.sim import Drawing
 
 
 def disturbances_of(run: Run) -> Scenario:
@@ -53,15 +53,14 @@ def drawn_disturbances(
         Shared nodes of a fleet, and their disturbances (see `dwell.draw`).
     """
     try:
-        return drawn_scenario(
-            problem,
-            scenario=scenario,
+        return Drawing(
+            *(problem, scenario),
             seed=seed,
             windows=windows,
             streams=streams,
             shared=shared,
             disturbances=disturbances,
-        )
+        ).episodes()
     except TraceError:
         # The episodes have recorded times, and a run does not include their traces.
         items = (*problem.scenario(scenario), *disturbances)

@@ -82,15 +82,9 @@ def sets_of(problem: Problem, realisation: Realisation) -> tuple[list[Scenario],
 
     A set is a scenario whose disturbances are always on.
     """
-    from dwell.sim import drawn_scenario
+    from dwell.sim import Drawing
 
-    drawn = drawn_scenario(
-        problem,
-        scenario=realisation.scenario,
-        seed=realisation.seed or 0,
-        windows=realisation.windows,
-        streams=realisation.streams,
-    )
+    drawn = Drawing.again(problem, realisation).episodes()
     kinds = list(dict.fromkeys(map(_always, drawn)))
     # Two equal disturbances may overlap, so a kind may be on twice.
     levels = np.zeros((realisation.cycles, len(kinds)), np.int64)

@@ -84,14 +84,15 @@ def timeline_of(
     written = problem.scenario(scenario)
     if not written:
         return Timeline()
-    from dwell.sim import draw_changes
+    from dwell.sim import Drawing
 
     window_s = problem.window_ms / 1e3
     windows = math.floor(seconds / window_s) + 1
     period_ms = problem.pipeline.period_ms
     require_length(windows, problem.window_cycles, period_ms, f"seconds = {seconds:g}")
     problem = _without_bursts(problem)
-    items, nodes, segments = draw_changes(problem, scenario=scenario, seed=seed, windows=windows)
+    drawing = Drawing(problem, scenario, seed=seed, windows=windows)
+    items, (nodes, segments) = drawing.episodes(), drawing.changes
     changes = [Change(one.at_ns, one.node, NodeState(one.threads, one.down)) for one in nodes]
     # The first segment of a link is undisturbed, unless a disturbance begins at 0.
     at_once = {item.place for item in items if first_ns(item) == 0}
