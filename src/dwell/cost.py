@@ -43,7 +43,6 @@ __all__ = [
     "TierNodes",
     "TierUtilisation",
     "busiest",
-    "censored",
     "cost",
     "cost_error",
     "exceeds",
@@ -309,17 +308,6 @@ def margin(one: float, other: float) -> float:
 def exceeds(gain: float, threshold: float) -> bool:
     """Return whether a gain exceeds a threshold by more than `GAIN_TOLERANCE`."""
     return gain > threshold + GAIN_TOLERANCE
-
-
-def censored(used: Metric, own: Metric) -> bool | NDArray[np.bool_]:
-    """Return whether a resource is saturated by load that includes other cells' unknown load.
-
-    Parameters
-    ----------
-    used, own : float, or array of shape (windows, resources)
-        Total busy share, and the cell's own share with its shadow jobs.
-    """
-    return (used >= SATURATED) & (own < SATURATED)
 
 
 def busiest(qos: QoS) -> float:

@@ -210,15 +210,8 @@ class Learning(Online):
             for name, (samples, last) in zip(self._parts, self._rows.weakest(), strict=True)
         }
 
-    def deviation(self) -> dict[str, float]:
-        """Return the deviation of the logarithm of each price due to the age of measurements."""
-        self._take_in_pending()
-        return {
-            name: max(self._widening(self._pools[part]) for part in parts)
-            for name, parts in self._parts.items()
-        }
-
     def _widening(self, pool: Pool) -> float:
+        """Return the deviation of the logarithm of a price due to the age of measurements."""
         if pool.is_declared:
             return 0.0
         return WIDENING * math.sqrt(max(self._windows_since(pool.last), 0))

@@ -30,10 +30,6 @@ class DueTasks:
         """Whether a task is due in a cycle."""
         return cycle % self.rates[task] == 0
 
-    def last_run(self, task: str, cycle: int) -> int:
-        """Return the last cycle up to `cycle` in which a task is due."""
-        return cycle - cycle % self.rates[task]
-
     def sends(self, flow: Flow, cycle: int) -> bool:
         """Whether a flow has a message in a cycle: a waited flow needs a target that is due."""
         return self.runs(flow.source if flow.sampled else flow.target, cycle)

@@ -25,7 +25,6 @@ from dwell.estimators.prices import SEED, prices_of
 from dwell.model.fleet import Fleet
 from dwell.model.progress import Progress
 from dwell.model.qos import QoS
-from dwell.record import FleetRun
 from dwell.sim.fleet import phased, priced_cells, tabled_cells
 
 #: Number of load levels per resource if several resources are shared.
@@ -74,10 +73,6 @@ class FleetPlan:
         """Return the cells with V_D above a limit."""
         return [name for name, qos in self.cells.items() if qos.violation_rate > limit]
 
-    def regret(self, run: FleetRun) -> float:
-        """Relative excess of a run's Φ, from its windows after the warm-up, over the plan's Φ."""
-        return phi_of(run) / self.phi - 1.0
-
     def as_json(self) -> dict[str, object]:
         """Return it as plain values."""
         return {
@@ -93,24 +88,6 @@ class FleetPlan:
                 for name, qos in self.cells.items()
             ],
         }
-
-
-def phi_of(run: FleetRun) -> float:
-    """Φ per cell of a run, from the mean metrics of its windows after the warm-up."""
-    own, shared = 0.0, 0.0
-    problems = run.fleet.problems
-    for name, one in run.cells.items():
-        terms, windows = CellTerms(problems[name], run.fleet.shared), one.arrays("windows")
-        counts = ~windows["warmup"]
-
-        def mean(column: str, windows: Any = windows, counts: Any = counts) -> float:
-            return float(np.nanmean(windows[column][counts]))
-
-        used = {name: mean(f"u_{name}") for name in terms.resources}
-        qos = QoS(mean("seen_l95_ms"), mean("seen_violation_rate"), used)
-        own, shared = own + terms.cost(qos), shared + terms.shared_cost(used)
-    count = len(run.cells)
-    return (own + shared / count) / count
 
 
 def plan_fleet(fleet: Fleet, *, seed: int = 1, progress: Progress | None = None) -> FleetPlan:

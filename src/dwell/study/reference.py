@@ -102,11 +102,6 @@ class References:
         """The best static placement in hindsight."""
         return min(self.statics, key=self.costs.__getitem__)
 
-    @property
-    def best_static_cost(self) -> float:
-        """Cost of the best static placement."""
-        return self.costs[self.best_static]
-
 
 def play_alone(problem: Problem, realisation: Realisation) -> dict[str, Run]:
     """Simulate every candidate alone, with the estimator ``profile``: shadow jobs would be load.
