@@ -818,12 +818,8 @@ def play_stamped(
     def never(at_ns: int) -> bool:
         return False
 
-    metrics: list[tuple[float | None, ...]] = [
-        (l95_ms, missed / max(counted, 1), None)
-        for _, _, missed, counted, l95_ms, *_ in arrays.tables.seen[0].tolist()
-    ]
     tables, _ = make_tables(
-        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), metrics, never),
+        sim_tables.PlayedRealisation(problem, real, controller, CellArrays(arrays), never),
         jobs=True,
     )
     flows = [(flow.source, flow.target) for flow in ordered_flows(problem.pipeline)]

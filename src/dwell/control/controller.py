@@ -233,7 +233,7 @@ class Controller:
         self._pricing = Pricing(problem.candidates, problem.objective)
         self._deadline_ns = problem.pipeline.deadline_ns
         #: Whether decisions are more frequent than windows.
-        self._has_looks = problem.decide_cycles < problem.window_cycles
+        self._has_looks = problem.decides_within_windows
         self._censor_ms = problem.censor_ms
         #: The policy's objective, else the cell's; its caps decide which candidates are eligible.
         self.objective: Objective = self._policy.objective or problem.objective

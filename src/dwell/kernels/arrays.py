@@ -326,9 +326,7 @@ class _Layout:
         self.logs_all, self.logs_windows = logs_all, logs_windows
         #: Cycles between two decisions of each cell; 0 if each window has one decision.
         self.decide_cycles = [
-            problem.decide_cycles
-            if decides and problem.decide_cycles < problem.window_cycles
-            else 0
+            problem.decide_cycles if decides and problem.decides_within_windows else 0
             for problem, _ in cells
         ]
         self.shadows = shadows if any(one is not None for one in shadows) else ()

@@ -354,6 +354,11 @@ class Problem(Displayed):
         return self.patience_cycles(slowest) + order
 
     @property
+    def decides_within_windows(self) -> bool:
+        """Whether decisions are more frequent than windows."""
+        return self.decide_cycles < self.window_cycles
+
+    @property
     def decisions_per_window(self) -> float:
         """W over the cycles between two decisions: 1 or more."""
         return self.window_cycles / self.decide_cycles

@@ -258,7 +258,6 @@ def play_cells(
             cell.realisation,
             cell.controller,
             stamper.arrays,
-            stamper.metrics,
             stamper.host_is_down,
         )
         for cell, stamper in zip(cells, stampers, strict=True)
@@ -314,7 +313,7 @@ class SimulatedStamper:
         self.cycles = realisation.cycles
         self.window_cycles, self.every = problem.window_cycles, problem.decide_cycles
         #: Whether decisions are more frequent than windows.
-        self.looks = self.every < self.window_cycles
+        self.looks = problem.decides_within_windows
         self.names = tuple(problem.candidates)
         self.code = {name: i for i, name in enumerate(self.names)}
         settings = problem.controller
@@ -334,9 +333,6 @@ class SimulatedStamper:
         #: Whether the guard wants probes in a run without a shadow.
         self.lacks_shadow = False
         self.course = controller.course
-        #: L95 (ms), violation rate and cost of every window as the controller saw them; empty if
-        #: decisions are more frequent than windows.
-        self.metrics: list[tuple[float | None, ...]] = []
         self.evidence = _evidence(problem, realisation, arrays) if controller.learns else None
         # Tables that every decision reads; they never grow.
         tables = arrays.tables
@@ -415,8 +411,6 @@ class SimulatedStamper:
             self.course.move(self.names[self.decided.item(0)])
         elif self.host_is_down(close_ns) or not self.seen[3].item(0, index):
             self.controller.miss()
-            if not self.looks:
-                self.metrics.append((None, None, None))
         else:
             self.consult(index, boundary, close_ns)
         if left == self.course.placement:
@@ -456,7 +450,6 @@ class SimulatedStamper:
             proposal = controller.propose_on(*seen, shares[1], recent=shares[0], **terms)
         else:
             proposal = controller.propose_on(*seen, shares, **terms)
-            self.metrics.append(proposal.seen)
         if watch is None or not self.course.by_guard:
             controller.commit(proposal)
             return

@@ -53,10 +53,6 @@ class PlayedRealisation:
     ----------
     problem, realisation, controller, arrays
         As after the simulation.
-    metrics : list of tuple
-        L95 (ms), violation rate and cost of every window as the controller saw them; None while
-        its node was down. The list is empty if the kernel decided, or if decisions are more
-        frequent than windows.
     host_down : function of int
         Whether the controller's node is down at an instant (ns).
     """
@@ -65,19 +61,15 @@ class PlayedRealisation:
     realisation: Realisation
     controller: Controller
     arrays: CellArrays
-    metrics: list[tuple[float | None, ...]]
     host_down: Callable[[int], bool]
-
-    @property
-    def looks(self) -> bool:
-        """Whether decisions are more frequent than windows."""
-        return self.problem.decide_cycles < self.problem.window_cycles
 
     @cached_property
     def looked(self) -> Rows:
         """Range and metrics of the cycles that each decision evaluated."""
+        if not self.problem.decides_within_windows:
+            return self.seen
         tables = self.arrays.tables
-        return tables.looked[0, : tables.cells[0]["look"]] if self.looks else self.seen
+        return tables.looked[0, : tables.cells[0]["look"]]
 
     @cached_property
     def seen(self) -> Rows:
@@ -355,18 +347,11 @@ def _shadow_columns(played: PlayedRealisation) -> dict[str, Callable[[], NDArray
 
 def _seen(played: PlayedRealisation) -> dict[str, Floats]:
     """Return the metrics of windows at their closes; NaN while the controller's node was down."""
-    tables = played.arrays.tables
-    if played.looks or played.by_kernel:
-        seen = {
-            "l95_ms": played.seen["l95_ms"],
-            "violation_rate": played.seen["missed"] / played.seen["counted"],
-        }
-        seen["cost"] = (
-            _costs(played, seen) if played.looks else tables.decided["measured"][: len(played.seen)]
-        )
-    else:
-        metrics = np.array(played.metrics, np.float64).reshape(-1, 3)
-        seen = dict(zip(("l95_ms", "violation_rate", "cost"), metrics.T, strict=True))
+    seen = {
+        "l95_ms": played.seen["l95_ms"],
+        "violation_rate": played.seen["missed"] / played.seen["counted"],
+    }
+    seen["cost"] = _costs(played, seen)
     for name, (metric, feature) in TERMS.items():
         if feature in played.features:
             seen[name] = np.where(np.isnan(seen["l95_ms"]), np.nan, played.seen[metric])
@@ -431,7 +416,7 @@ def _decided_by_kernel(played: PlayedRealisation) -> TableArrays:
         "dwell_cycles": decided["dwell"] * played.problem.decide_cycles,
         "delta_j": decided["delta_j"],
     }
-    if played.looks:
+    if played.problem.decides_within_windows:
         used = tables.look_shares[0, :count, 1, 0].T
         columns |= {
             "seen_l95_ms": looked["l95_ms"],

@@ -34,7 +34,7 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
     J includes the switching terms of the moves in a window.
     """
     windows = run.arrays("windows")
-    if problem.decide_cycles < problem.window_cycles:
+    if problem.decides_within_windows:
         moved = _moves(run.arrays("cycles").names("placement"), problem)
         first, width = windows["first_cycle"], problem.window_cycles
         switching = np.array([moved[at : at + width].sum() for at in first.tolist()])
