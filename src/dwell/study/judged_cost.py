@@ -34,12 +34,9 @@ def judged_costs(run: Run, problem: Problem) -> Floats:
     J includes the switching terms of the moves in a window.
     """
     windows = run.arrays("windows")
-    if problem.decides_within_windows:
-        moved = _moves(run.arrays("cycles").names("placement"), problem)
-        first, width = windows["first_cycle"], problem.window_cycles
-        switching = np.array([moved[at : at + width].sum() for at in first.tolist()])
-    else:
-        switching = _moves(windows.names("placement"), problem)
+    moved = _moves(run.arrays("cycles").names("placement"), problem)
+    first, width = windows["first_cycle"], problem.window_cycles
+    switching = np.array([moved[at : at + width].sum() for at in first.tolist()])
     problem.objective.require_judgeable(run.problem.objective)
     _require_prices(run, problem)
     l95_ms, rate = windows["seen_l95_ms"], windows["seen_violation_rate"]
