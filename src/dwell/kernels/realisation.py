@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,11 +113,8 @@ class NodeChanges(Sequence[NodeChange]):
     def __len__(self) -> int:
         return len(self.table)
 
-    @overload
-    def __getitem__(self, index: int) -> NodeChange: ...
-    @overload
-    def __getitem__(self, index: slice) -> NodeChanges: ...
-    def __getitem__(self, index: Any) -> NodeChange | NodeChanges:
+    def __getitem__(self, index: Any) -> Any:
+        """Return a change, or the changes of a slice."""
         if isinstance(index, slice):
             return NodeChanges(self.nodes, self.table[index])
         at_ns, node, threads, down = self.table[index].tolist()
@@ -166,11 +163,8 @@ class LinkSegments(Sequence[LinkSegment]):
     def __len__(self) -> int:
         return len(self.table)
 
-    @overload
-    def __getitem__(self, index: int) -> LinkSegment: ...
-    @overload
-    def __getitem__(self, index: slice) -> LinkSegments: ...
-    def __getitem__(self, index: Any) -> LinkSegment | LinkSegments:
+    def __getitem__(self, index: Any) -> Any:
+        """Return a segment, or the segments of a slice."""
         if isinstance(index, slice):
             return LinkSegments(self.links, self.table[index], self.table_f[index])
         at_ns, link, down, mask = self.table[index].tolist()
