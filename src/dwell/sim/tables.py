@@ -29,8 +29,9 @@ from dwell.kernels.rows import Rows
 from dwell.model import REASONS, Problem
 from dwell.model.instants import HORIZON_NS, NEVER_NS
 from dwell.model.number_arrays import Floats, Ints
+from dwell.model.table_columns import Feature
 from dwell.model.window_close import window_close_ns
-from dwell.record import OUTCOMES, Feature, Names, TableArrays, frame_of
+from dwell.record import OUTCOMES, Names, TableArrays, frame_of
 from dwell.sim.chain_ages import chain_ages_ns, reaction_l95_ms
 
 if TYPE_CHECKING:

@@ -24,7 +24,8 @@ from dwell.live.roles.loads import ProcessLoads
 from dwell.live.roles.offsets import UNBOUNDED_NS
 from dwell.live.wire.messages import NOT_APPLIED
 from dwell.model.instants import NEVER_NS
-from dwell.record import Columns, Feature, Row, Values, column_types, row_of
+from dwell.model.table_columns import Feature
+from dwell.record import Columns, Row, Values, column_types, row_of
 
 Rows: TypeAlias = dict[str, list[Row]]
 #: Estimates of a candidate in the status.
