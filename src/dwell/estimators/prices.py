@@ -32,14 +32,10 @@ from dwell.kernels.codes import CycleOutcome
 from dwell.kernels.over_age import due_misses
 from dwell.kernels.random_draws import Drawing
 from dwell.kernels.realisation import Realisation
-from dwell.model.fabric import Fabric
 from dwell.model.frozen import FrozenDict
 from dwell.model.instants import NEVER_NS, longest_run
 from dwell.model.number_arrays import Floats, Ints
-from dwell.model.objective import MissCap
 from dwell.model.order_statistic import order_statistic_of_smallest
-from dwell.model.pipeline import Pipeline
-from dwell.model.placement import Placement
 from dwell.model.problem import Problem
 from dwell.model.qos import NO_AGE, QoS
 from dwell.model.scenario import Scenario
@@ -138,22 +134,12 @@ class Price:
 class Question:
     """The properties of a problem that determine its prices."""
 
-    pipeline: Pipeline
-    fabric: Fabric
-    candidates: Mapping[str, Placement]
-    window_cycles: int
-    censor_ms: float
-    close_grace_ms: float
-    scenario: Scenario
-    decide_cycles: int
-    name: str
+    #: All values of the problem that determine its prices.
+    values: tuple[object, ...] = field(repr=False)
+    scenario: str
     seed: int
     cycles: int | None
     shadow_fractions: Mapping[str, float]
-    #: Chain whose data age counts as latency; whether J weighs the mean age; the cap on misses.
-    latency: str | None
-    weighs_age: bool
-    misses: MissCap | None
     problem: Problem = field(compare=False, repr=False)
 
     @classmethod
@@ -171,24 +157,14 @@ class Question:
         sent = {name: fractions[name] if name in hindered(problem) else 0.0 for name in fractions}
         if problem.pipeline.phase_ms is not None:
             problem = problem.at_phase(None)
-        return cls(
-            pipeline=problem.pipeline,
-            fabric=problem.fabric,
-            candidates=problem.candidates,
-            window_cycles=problem.window_cycles,
-            censor_ms=problem.censor_ms,
-            close_grace_ms=problem.controller.close_grace_ms,
-            scenario=problem.scenario(scenario),
-            decide_cycles=problem.decide_cycles,
-            name=scenario,
-            seed=seed,
-            cycles=cycles,
-            shadow_fractions=FrozenDict(sent if any(sent.values()) else {}),
-            latency=problem.objective.latency,
-            weighs_age=problem.objective.weighs_age,
-            misses=problem.objective.caps.misses,
-            problem=problem,
+        objective = problem.objective
+        values = (
+            *(problem.pipeline, problem.fabric, problem.candidates, problem.scenario(scenario)),
+            *(problem.window_cycles, problem.decide_cycles, problem.controller.close_grace_ms),
+            *(problem.censor_ms, objective.latency, objective.weighs_age, objective.caps.misses),
         )
+        fractions = FrozenDict(sent if any(sent.values()) else {})
+        return cls(values, scenario, seed, cycles, fractions, problem)
 
 
 #: Known prices of this process; another process can take them over.
@@ -216,16 +192,14 @@ def prices_of(
 def _answer(question: Question) -> Mapping[str, Price]:
     problem = with_windows_up_to(LONGEST_WINDOW, question.problem)
     most = most_windows(problem, question.cycles)
-    slow = slow_processes(problem, question.name)
+    slow, misses = slow_processes(problem, question.scenario), problem.objective.caps.misses
     loop = slow.whole_loops(problem.window_cycles, most - SETTLING)
     least_cycles = slow.least_cycles(problem.pipeline.period_ms)
-    if question.misses is not None:
-        least_cycles = max(
-            least_cycles, question.misses.least_cycles * problem.pipeline.due_interval
-        )
+    if misses is not None:
+        least_cycles = max(least_cycles, misses.least_cycles * problem.pipeline.due_interval)
     least = SETTLING + math.ceil(least_cycles / problem.window_cycles)
-    windows = min(_first_windows(problem, question.scenario), most)
-    if question.misses is not None:
+    windows = min(_first_windows(problem, problem.scenario(question.scenario)), most)
+    if misses is not None:
         windows = min(max(windows, least), most)
     if question.cycles is not None:
         windows = most
@@ -236,10 +210,12 @@ def _answer(question: Question) -> Mapping[str, Price]:
     found: dict[str, Price] = {}
     left = list(problem.candidates)
     if question.shadow_fractions:
-        found |= prices_of(problem, question.name, seed=question.seed, cycles=question.cycles)
+        found |= prices_of(problem, question.scenario, seed=question.seed, cycles=question.cycles)
         left = [name for name in left if question.shadow_fractions[name]]
     while True:
-        drawing = Drawing(problem, question.name, seed=question.seed, windows=windows, wraps=True)
+        drawing = Drawing(
+            problem, question.scenario, seed=question.seed, windows=windows, wraps=True
+        )
         realisation = drawing.take(windows)
         shadows = None
         if question.shadow_fractions:
