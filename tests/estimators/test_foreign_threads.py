@@ -338,7 +338,7 @@ def of_a_fleet(problem: Problem, policies: Sequence[str], shadow_fraction: float
         PlayedCell(problem, real, Controller(problem, policy, probe), guarded=False)
         for policy, probe in zip(policies, probes, strict=True)
     ]
-    assert play_cells(cells, shared=("E",), by_window=True)
+    assert play_cells(lambda: cells, shared=("E",), by_window=True)
     return probes[0].evidence
 
 

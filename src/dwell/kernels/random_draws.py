@@ -299,7 +299,6 @@ class Drawing:
                 f"{windows} windows are more than are left: {self.cycles - begin} cycles"
             )
         self.drawn += cycles
-        exec_ns, delay_ns, extra_ns = self._parts(self._filled(cycles))
         node_changes, link_segments = self.changes
         return Realisation(
             scenario=self.name,
@@ -307,18 +306,13 @@ class Drawing:
             windows=windows,
             release_ns=self.release_ns[begin : self.drawn + 1],
             sites=self.sites,
-            exec_ns=exec_ns,
             hops=self.hops,
-            delay_ns=delay_ns,
-            loss_keys=self._loss_keys(),
-            layers=self._layers(),
-            extra_ns=extra_ns,
             node_changes=node_changes,
             link_segments=link_segments,
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
             streams=self.streams,
-            forwards=self.forwards,
+            **self._sampled(self._filled(cycles)),
         )
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:
@@ -333,16 +327,19 @@ class Drawing:
         for row, values, rate in zip(table, drawn, rates, strict=True):
             due = sent % rate == 0 if rate > 1 else slice(None)
             row[sent[due]] = values[due]
+        return replace(realisation, **self._sampled(table))
+
+    def _sampled(self, table: Ints) -> dict[str, Any]:
+        """Return the fields of a realisation that depend on the sampled cycles, or on shadows."""
         exec_ns, delay_ns, extra_ns = self._parts(table)
-        return replace(
-            realisation,
-            exec_ns=exec_ns,
-            delay_ns=delay_ns,
-            loss_keys=self._loss_keys(),
-            layers=self._layers(),
-            extra_ns=extra_ns,
-            forwards=self.forwards,
-        )
+        return {
+            "exec_ns": exec_ns,
+            "delay_ns": delay_ns,
+            "loss_keys": self._loss_keys(),
+            "layers": self._layers(),
+            "extra_ns": extra_ns,
+            "forwards": self.forwards,
+        }
 
     def _filled(self, cycles: int) -> Ints:
         """Sample the next cycles, with one row per site, then per hop, then per extra delay."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -112,10 +112,12 @@ def simulate_realisation(
     _check_fit(problem, realisation)
     chains = tuple(problem.pipeline.chains)
     require_apart(tuple(resources_of(problem.fabric.nodes)), tuple(problem.candidates), chains)
-    asked = problem, realisation, policy, estimator, jobs, guard, by_window
-    # Simulate without shadows first, which is faster, and again with shadows only if the guard
-    # wants probes. Both give the same up to the first probe.
-    played = cast("PlayedRealisation", _play(*asked) or _play(*asked, shadow=True))
+
+    def cells() -> list[PlayedCell]:
+        controller = Controller(problem, policy, estimator)
+        return [PlayedCell(problem, realisation, controller, guard and controller.guarded)]
+
+    (played,) = play_cells(cells, jobs=jobs, by_window=by_window)
     meta = partial(
         meta_of,
         played.controller,
@@ -157,24 +159,6 @@ def describe(
     return Run(meta, {}).meta
 
 
-def _play(
-    problem: Problem,
-    realisation: Realisation,
-    policy: MinimalPolicy | str | None,
-    estimator: Estimator | str | None,
-    jobs: bool,
-    guard: bool,
-    by_window: bool,
-    *,
-    shadow: bool = False,
-) -> PlayedRealisation | None:
-    """Simulate a realisation; return None if the guard wants probes but has no shadow."""
-    controller = Controller(problem, policy, estimator)
-    cell = PlayedCell(problem, realisation, controller, guard and controller.guarded)
-    played = play_cells([cell], jobs=jobs, by_window=by_window, shadow=shadow)
-    return None if played is None else played[0]
-
-
 class PlayedCell(NamedTuple):
     """A cell to simulate.
 
@@ -193,28 +177,46 @@ class PlayedCell(NamedTuple):
 
 
 def play_cells(
-    cells: Sequence[PlayedCell],
+    cells: Callable[[], Sequence[PlayedCell]],
     *,
     shared: Collection[str] = (),
     jobs: bool = False,
     by_window: bool = False,
-    shadow: bool = False,
     progress: Progress | None = None,
-) -> list[PlayedRealisation] | None:
-    """Simulate cells together; return None if a cell wants probes but has no shadow.
+) -> list[PlayedRealisation]:
+    """Simulate cells together.
 
     Parameters
     ----------
+    cells : callable
+        Makes the cells.
     shared : collection of str
         Nodes that the cells share.
     jobs : bool
         Whether to record all jobs.
     by_window : bool
         See `simulate_realisation`.
-    shadow : bool
-        Whether all guarded cells have a shadow, even if their estimators send none.
     progress : callable, optional
         Receives the number of closed windows and the number of all windows.
+    """
+    asked = shared, jobs, by_window, progress
+    # Simulate without shadows first, which is faster, and again with shadows only if a guard wants
+    # probes. Both give the same up to the first probe.
+    return _play(cells(), *asked) or _play(cells(), *asked, shadow=True)
+
+
+def _play(
+    cells: Sequence[PlayedCell],
+    shared: Collection[str],
+    jobs: bool,
+    by_window: bool,
+    progress: Progress | None,
+    *,
+    shadow: bool = False,
+) -> list[PlayedRealisation]:
+    """Simulate cells; return no result if a cell wants probes but has no shadow.
+
+    If `shadow`, all guarded cells have a shadow, even if their estimators send none.
     """
     plans = [_shadow_plan(cell, shadow and cell.guarded) for cell in cells]
     whole = lay_out(
@@ -251,7 +253,7 @@ def play_cells(
             if progress is not None:
                 progress(sum(one.closed.item(0) for one in stampers), total)
         if stamper.lacks_shadow:
-            return None
+            return []
     return [
         PlayedRealisation(
             cell.problem,

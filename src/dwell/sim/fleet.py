@@ -142,23 +142,23 @@ def play_fleet(
     problems = dict(zip(names, phased(fleet, seed), strict=True))
     realisations = drawn(fleet, problems, seed, duration_ns)
 
-    asked = partial(coordinations, fleet, problems, seed, progress)
-
     def cells() -> Iterator[PlayedCell]:
-        for cell, asks in zip(fleet.cells, asked(), strict=True):
+        asking = coordinations(fleet, problems, seed, progress)
+        for cell, asks in zip(fleet.cells, asking, strict=True):
             chosen = cell.entry.policy or fleet.policy
             named = cell.entry.estimator or fleet.estimator
             problem, realisation = problems[cell.name], realisations[cell.name]
             controller = Controller(problem, chosen, named, asks)
             yield PlayedCell(problem, realisation, controller, guard and controller.guarded)
 
-    # The kernel implements the rules of policies, but no coordination.
-    by_window = fleet.coordination != "none"
-    play = partial(
-        play_cells, shared=fleet.shared, jobs=jobs, by_window=by_window, progress=progress
+    played = play_cells(
+        lambda: [*cells()],
+        shared=fleet.shared,
+        jobs=jobs,
+        # The kernel implements the rules of policies, but no coordination.
+        by_window=fleet.coordination != "none",
+        progress=progress,
     )
-    # Simulate again with shadows only if a guard wants probes, as in `simulate_realisation`.
-    played = play([*cells()]) or play([*cells()], shadow=True) or []
     return dict(zip(names, played, strict=True))
 
 
