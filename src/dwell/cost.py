@@ -35,26 +35,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-__all__ = [
-    "ERRORS",
-    "GAIN_TOLERANCE",
-    "SATURATED",
-    "SELECTED",
-    "TierNodes",
-    "TierUtilisation",
-    "busiest",
-    "cost",
-    "cost_error",
-    "exceeds",
-    "excess",
-    "hamming",
-    "margin",
-    "margin_errors",
-    "price",
-    "tier_nodes",
-    "tier_utilisation",
-    "weighed",
-]
+__all__ = ["cost", "hamming"]
 
 Metric = TypeVar("Metric", float, "NDArray[np.float64]")
 

@@ -31,13 +31,6 @@ __all__ = [
     "TrustError",
     "UnwritableError",
     "UserNote",
-    "describe_raised",
-    "installing",
-    "lacking",
-    "line_and_code",
-    "missing_package",
-    "not_installed",
-    "user_note",
 ]
 
 #: Longest text of an error from foreign code, in characters.
