@@ -32,7 +32,6 @@ SECTIONS = {
     "How to": "howto",
     "Reference": "reference",
     "Background": "background",
-    "Decisions": "decisions",
 }
 CONTRACTS = (
     "docs/concepts.md",

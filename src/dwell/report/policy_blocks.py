@@ -50,7 +50,7 @@ MORE = (
 MOST_COLUMNS = 5
 #: In percent.
 THE_AIM = Limit(100 * AIM, "the aim, 5 %")
-#: Pattern of the only sentence that code makes of numbers (docs/decisions/0007-pages.md).
+#: Pattern of the only sentence that code makes of numbers (docs/background/decisions.md).
 HEADLINE = "V_D under 5 %: {most} in {count} of {of} scenarios; in all: {all}; not shown: {open}."
 KEYS = ("scenario", "policy")
 #: Approximate largest number of points of a line: bins of the logarithmic axis.

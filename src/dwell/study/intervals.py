@@ -11,7 +11,7 @@ kinds of number need three kinds of interval:
   interval assumes nothing about the shape, and never interpolates.
 
 Rates of misses are skewed and seeds are few. Student's t then gives upper limits that are too low
-(docs/decisions/0005-statistics.md has the rules). It replaces the bootstrap only when the
+(docs/background/statistics.md has the rules). It replaces the bootstrap only when the
 bootstrap gives no limit: below `FEWEST` values, or when almost all values are equal.
 """
 
