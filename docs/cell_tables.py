@@ -6,7 +6,7 @@ A table stands between ``<!-- keys of NAME -->`` and the next empty line.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Mapping
 from pathlib import Path
 
 from dwell.cellfile import cell_form, fleet_file, study_form
@@ -26,7 +26,8 @@ from dwell_lab.testbed import inventory
 
 FOLDER = Path(__file__).parent / "reference"
 FILES = tuple(FOLDER / name for name in ("cells.md", "files.md"))
-SHAPES = {
+#: Shapes of the tables. The second of two is a shape whose keys the table leaves out.
+SHAPES: Mapping[str, Shape | tuple[Shape, Shape]] = {
     "the file": cell_form.CELL.shape,
     "a trace": cell_form.TRACE,
     "a node": cell_form.NODE,
@@ -50,16 +51,17 @@ SHAPES = {
     "its target": cell_form.TARGET,
     "a ROS 2 topic": cell_form.ROS_TOPIC,
     "live": cell_form.LIVE,
-    "ROS 2 commands": cell_form.ROS_COMMANDS,
+    "ROS 2 commands": (cell_form.ROS_COMMANDS, cell_form.ROS_TOPIC),
     "a host": cell_form.HOST,
     "a fleet": fleet_file.FLEET.shape,
     "an entry": fleet_file.ENTRY,
     "a study": study_form.STUDY.shape,
-    "a study of a fleet": study_form.FLEET_STUDY.shape,
+    "a study of a fleet": (study_form.FLEET_STUDY.shape, study_form.STUDY.shape),
     "an inventory": inventory.INVENTORY.shape,
     "a real host": inventory.HOST,
     "link commands": inventory.LINK,
 }
+HEAD = "| key | value | default | tier | meaning |", "|---|---|---|---|---|"
 PLACE = re.compile(r"<!-- keys of ([^\n]*) -->\n(?:\|[^\n]*\n)*")
 
 
@@ -69,14 +71,15 @@ def with_tables(text: str) -> str:
 
 
 def _table(name: str) -> str:
-    return "".join(f"{line}\n" for line in _lines(SHAPES[name]))
+    shape = SHAPES[name]
+    full, base = shape if isinstance(shape, tuple) else (shape, None)
+    known = set() if base is None else {_row(key) for key in base.keys}
+    rows = (row for row in map(_row, full.by_tier) if row not in known)
+    return "".join(f"{line}\n" for line in (*HEAD, *rows))
 
 
-def _lines(shape: Shape) -> Iterator[str]:
-    yield "| key | value | default | tier | meaning |"
-    yield "|---|---|---|---|---|"
-    for key in shape.by_tier:
-        yield f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.tier} | {key.says} |"
+def _row(key: FormKey) -> str:
+    return f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.tier} | {key.says} |"
 
 
 def words(form: Form) -> str:

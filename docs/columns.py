@@ -4,18 +4,37 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dwell.model.table_columns import TABLES, Column
+from dwell.model.table_columns import (
+    GUARD,
+    LOST,
+    TABLES,
+    UNCOMPARED,
+    UNMEASURED,
+    UNSEEN,
+    UNTOLD,
+    Column,
+)
 from dwell.record import OUTCOME_SENTENCES, REASON_SENTENCES
 
 PAGE = Path(__file__).with_name("reference") / "columns.md"
-#: The first table; the text above it is written by hand.
-FIRST = "## cycles"
+#: Words for the usual reasons of null.
+WORDS = {
+    "guard": GUARD,
+    "lost": LOST,
+    "uncompared": UNCOMPARED,
+    "uncounted": UNTOLD,
+    "unmeasured": UNMEASURED,
+    "unseen": UNSEEN,
+}
+#: Begin of the text that is not written by hand.
+FIRST = "The last column has the reasons of null:"
 HEAD = "| column | type | unit | meaning | null |\n|---|---|---|---|---|\n"
 
 
 def tables() -> str:
     """Return the tables of columns, outcomes and reasons."""
-    parts = []
+    legend = "; ".join(f"*{word}*: {reason}" for word, reason in WORDS.items())
+    parts = [f"{FIRST} {legend}.\n"]
     for name, table in TABLES.items():
         kept = "; kept on request" if table.on_request else ""
         rows = "".join(map(_row, table.columns))
@@ -32,7 +51,10 @@ def tables() -> str:
 def _row(column: Column) -> str:
     name = column.name.replace("{", "<").replace("}", ">")
     tables = f" ({' or '.join(column.of)})" if column.of else ""
-    cells = (f"`{name}`{tables}", column.kind, column.unit, column.sentence, column.null)
+    null = column.null
+    for word, reason in WORDS.items():
+        null = null.replace(reason, f"*{word}*")
+    cells = (f"`{name}`{tables}", column.kind, column.unit, column.sentence, null)
     return f"| {' | '.join(cells)} |\n"
 
 

@@ -135,7 +135,7 @@ TRACE = Shape(
             "error",
         ),
         optional(
-            "wrap", FlagForm(), "Whether to go on at the beginning when the rows end.", "false"
+            "wrap", FlagForm(), "Whether to continue with the first row after the last.", "false"
         ),
         optional(
             "sha256",
@@ -307,7 +307,7 @@ LINK = shape_of(
         optional(
             "both_ways",
             FlagForm(),
-            "Whether there is the same link back too, drawn independently.",
+            "Whether the same link exists in the other direction, too, with its own random values.",
             "false",
             tier="first",
         ),
@@ -373,7 +373,7 @@ TASK = shape_of(
         "depth": optional(
             "depth",
             INPUT,
-            "What waits for a worker: `queue` without a bound, `latest` only, or a bounded queue.",
+            "Jobs that may wait for a worker: all (`queue`), the newest (`latest`), or a number.",
             "queue",
             named="input",
             tier="first",
@@ -383,7 +383,7 @@ TASK = shape_of(
         optional(
             "workers",
             NumberForm(WORKERS),
-            "Jobs that may run at a time on each node that does not say.",
+            "Jobs that may run at a time on each node.",
             "1",
         ),
     ),
@@ -425,8 +425,13 @@ def _disturbance() -> Shape:
     known = {key.name: key for key in (*node.keys, *link.keys)}
     first = optional("node", NAME, known.pop("node").says, tier="first")
     further = (
-        optional("link", NAME, "Link that it happens to, as `R1->E`.", tier="first"),
-        optional("both_ways", FlagForm(), "Whether it happens to the link back as well.", "false"),
+        optional("link", NAME, "Disturbed link, as `R1->E`.", tier="first"),
+        optional(
+            "both_ways",
+            FlagForm(),
+            "Whether it also disturbs the link in the other direction.",
+            "false",
+        ),
     )
     return Shape(
         "Disturbance",

@@ -115,7 +115,7 @@ STUDY = FileKind.of(
     optional(
         "seeds",
         WrittenForm("number, list, `{from, count}`", _seeds),
-        "A number of seeds, or which.",
+        "Number of seeds, or the seeds.",
         "20",
     ),
     optional(

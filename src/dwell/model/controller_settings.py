@@ -36,7 +36,7 @@ class ControllerSettings:
     """The controller: its node, policy and estimator, and the timing of its orders."""
 
     on: str | None = key(
-        "Node it sits on.",
+        "Node of the controller.",
         default=None,
         usual="the first edge node, else the first node",
         tier="first",
@@ -66,7 +66,7 @@ class ControllerSettings:
         digested="decision",
     )
     min_dwell_cycles: int = key(
-        "Cycles that a placement stays at least, where N_min windows are fewer.",
+        "Cycles that a placement stays at least, if N_min windows are fewer.",
         MIN_DWELL_CYCLES,
         default=0,
         digested="decision",
@@ -97,9 +97,9 @@ class ControllerSettings:
         digested="decision",
     )
     shadow_fraction: float | Literal["auto"] = key(
-        "Share of cycles that are also sent through each alternative, where the estimator uses "
-        "shadow jobs; `auto`: by placement, the largest of at most 0.05 that costs the cell's own "
-        "cycles next to nothing.",
+        "Share of cycles that are also sent through each alternative, if the estimator uses "
+        "shadow jobs; `auto`: for each placement the largest share, up to 0.05, that hardly delays "
+        "the cell's own cycles.",
         replace(SHADOW_FRACTION, word=AUTO),
         default=AUTO,
         digested="decision",
@@ -116,13 +116,13 @@ class ControllerSettings:
         default="warm",
     )
     guard_cycles: int = key(
-        "Periods without a completion after which the guard on the robot moves to a fallback.",
+        "The guard moves the cell to a fallback after max(D, P) + (g - 1) P without a completion.",
         GUARD_CYCLES,
         default=3,
     )
     probe_cycles: int = key(
-        "Cycles that must complete through another placement, too, before the guard's is left for "
-        "it, and that the guard rests for after its own move.",
+        "Cycles that must complete through a placement before the cell leaves the guard's fallback "
+        "for it; also the length of the guard's rest after its own move.",
         PROBE_CYCLES,
         default=30,
     )

@@ -107,7 +107,7 @@ class Node:
     )
     quota: Quota | None = key("CPU bandwidth limit on everything that runs there.", default=None)
     background: float = key(
-        "Cores that others than the jobs always take, in small pieces; less than the node can do.",
+        "Cores that other work always takes, in small pieces; less than the node's capacity.",
         Bound(0, 4096),
         default=0.0,
         is_rare=True,

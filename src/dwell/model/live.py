@@ -76,7 +76,7 @@ class LiveSettings:
         digested="decision",
     )
     relay: str | None = key(
-        "Node that carries small messages where a direct link fails.",
+        "Node that carries small messages if a direct link fails.",
         default=None,
         usual="the controller's",
     )
@@ -101,14 +101,13 @@ class LiveSettings:
         default=AIM,
     )
     actuators: Mapping[str, str | RosActuator] = key(
-        "What applies the commands of a sink task: `package.module:Name`, or `{ros2: {...}}` for "
-        "a ROS 2 topic.",
+        "Actuator of each sink task: `package.module:Name`, or `{ros2: {...}}` for a ROS 2 topic.",
         default_factory=FrozenDict,
         digested="code",
         tier="first",
     )
     observer: str | None = key(
-        "What looks on where `dwell live run` runs the cell, as `package.module:Name`.",
+        "Observer of the cell in `dwell live run`, as `package.module:Name`.",
         default=None,
         digested="decision",
     )

@@ -69,13 +69,13 @@ class Targets:
     robot: float = key("Of robot utilisation.", TARGET, default=0.7)
     edge: float = key("Of edge utilisation.", TARGET, default=0.7)
     cloud: float | None = key(
-        "Of cloud utilisation; needed where `weights` has `cloud`.", TARGET, default=None
+        "Of cloud utilisation; required with `weights.cloud`.", TARGET, default=None
     )
     age_ms: float | None = key(
-        "Of the mean age, ms; needed where `weights` has `age`.", TARGET, default=None
+        "Of the mean age, ms; required with `weights.age`.", TARGET, default=None
     )
     price_per_hour: float | None = key(
-        "Of the price of transmitted bytes, money per hour; needed where `weights` has `price`.",
+        "Of the price of transmitted bytes, money per hour; required with `weights.price`.",
         TARGET,
         default=None,
     )

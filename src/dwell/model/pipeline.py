@@ -180,7 +180,7 @@ class Pipeline:
         tier="measured",
     )
     scales: Mapping[str, Process] = key(
-        "Factors, one a cycle, that tasks may name, as the scene's complexity.",
+        "Factors by name, one per cycle, on execution times, as the complexity of the scene.",
         default_factory=FrozenDict,
         tier="measured",
     )

@@ -57,8 +57,7 @@ class Problem(Displayed):
     pipeline: Pipeline
     fabric: Fabric
     candidates: Mapping[str, Placement] = key(
-        "Placements the policy may choose, by name: relocatable task to node; anchored "
-        "tasks follow.",
+        "Placements that the policy may choose, by name: a node for each relocatable task.",
         tier="first",
     )
     objective: Objective = key("Cost, targets and caps.", tier="first")

@@ -130,9 +130,9 @@ CYCLES = (
     Column(
         "missed",
         "Boolean",
-        "Later than D, or unfinished when its window closed, which is no earlier; or its data "
-        "are over the `max_age_ms` of a chain; or its command was not applied. False where a live "
-        "run's controller could not hear of it, or after the last window of a simulated run.",
+        "Later than D, or unfinished when its window closed; or its data were over the "
+        "`max_age_ms` of a chain; or its command was not applied. False if a live run's controller "
+        "could not know of it, or after the last window of a simulated run.",
     ),
     Column("outcome", "outcome", "Its end."),
     Column("compute_ns", "Int64", "Part of the latency: execution.", "ns", APART),
@@ -298,7 +298,7 @@ DECISIONS = (
     Column(
         "est_l95_error_ms_{candidate}",
         "Float64",
-        "Standard error of its estimated L95; 0 where the estimator says none.",
+        "Standard error of its estimated L95; 0 if the estimator states none.",
         "ms",
         GUARD,
     ),
@@ -333,7 +333,7 @@ DECISIONS = (
     Column(
         "excess_{candidate}",
         "Float64",
-        "Its largest value / cap − 1; ∞ where its L95 is lost, and has a cap.",
+        "Its largest value / cap − 1; ∞ if its L95 is lost, and has a cap.",
         null=f"{GUARD}, or no caps",
     ),
     Column(
@@ -353,9 +353,9 @@ DECISIONS = (
     Column(
         "refused",
         "String",
-        "A decision that was not carried out, and the reason: `migrated` is false, `placement` "
-        "the old placement, and `reason` the policy's. In a fleet also the incumbent while its "
-        "windows disagree with the simulated ones.",
+        "A decision that was not carried out, and why: `migrated` is false, `placement` the old "
+        "placement, and `reason` the policy's. In a fleet also the incumbent while its windows "
+        "disagree with the simulated windows.",
         null="the decision was carried out",
         of=("live", "fleet"),
     ),
@@ -405,7 +405,7 @@ JOBS = (
     Column(
         "ending_ns",
         "Int64",
-        "CPU time of its node between the end of a sink's and the hand-over of its command.",
+        "CPU time of its node between the end of a sink's job and the hand-over of its command.",
         "ns",
         UNTOLD,
         LIVE,
