@@ -426,12 +426,7 @@ def _disturbance() -> Shape:
     first = optional("node", NAME, known.pop("node").says, tier="first")
     further = (
         optional("link", NAME, "Disturbed link, as `R1->E`.", tier="first"),
-        optional(
-            "both_ways",
-            FlagForm(),
-            "Whether it also disturbs the link in the other direction.",
-            "false",
-        ),
+        optional("both_ways", FlagForm(), "Whether it also disturbs the link back.", "false"),
     )
     return Shape(
         "Disturbance",

@@ -105,7 +105,7 @@ class ControllerSettings:
         digested="decision",
     )
     half_life_windows: float = key(
-        "Windows after which a measurement counts half.",
+        "Half-life of estimators, windows: they keep measured values for 1 to 6 half-lives.",
         HALF_LIFE_WINDOWS,
         default=2.0,
         digested="decision",
