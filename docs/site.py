@@ -17,8 +17,10 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 SOURCE, SITE = ROOT / "build" / "site-source", ROOT / "build" / "site"
-API = "docs/reference/api.md"
+API, STYLES = "docs/reference/api.md", "docs/site.css"
 LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)\s]*)?\)")
+#: Text and target of a link on the page of all pages.
+NAMED_LINK = re.compile(r"\[([^\]]+)\]\(([^)\s#]+)\)")
 #: A name with its own entry on the page of the Python interface.
 NAME = re.compile(r"^\| `(dwell[\w.]*)` \|", re.MULTILINE)
 #: Attributes by which a page loads a file.
@@ -33,12 +35,8 @@ SECTIONS = {
     "Reference": "reference",
     "Background": "background",
 }
-CONTRACTS = (
-    "docs/concepts.md",
-    "docs/guard.md",
-    "docs/live-protocol.md",
-    "docs/architecture.md",
-)
+#: Pages of docs itself, which begin the section Background.
+RULES = ("docs/concepts.md", "docs/guard.md", "docs/live-protocol.md", "docs/architecture.md")
 
 
 def linked(page: str, text: str) -> set[str]:
@@ -71,7 +69,7 @@ def stage(folder: Path) -> dict[str, str]:
     """Write the sources of the site into a folder; return the pages."""
     found = pages()
     others = {name for page, text in found.items() for name in linked(page, text)} - found.keys()
-    for name in sorted(others):
+    for name in sorted({*others, STYLES}):
         if (ROOT / name).is_file():
             target = folder / name
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -90,20 +88,26 @@ def title(text: str) -> str:
 
 
 def navigation(found: dict[str, str]) -> list[object]:
-    """Return the navigation of the site: pages by folder, in the order of the index."""
-    index = found["docs/index.md"]
-    order = [os.path.normpath(f"docs/{target}") for target in LINK.findall(index)]
+    """Return the navigation of the site: pages by folder, as the index names and orders them."""
+    links = NAMED_LINK.findall(found["docs/index.md"])
+    names = {os.path.normpath(f"docs/{target}"): name for name, target in links}
+    order = [*names]
     listed = sorted(found, key=lambda page: order.index(page) if page in order else len(order))
 
+    def entry(page: str) -> dict[str, str]:
+        name = names.get(page) or title(found[page])
+        return {name[0].upper() + name[1:]: page}
+
     def entries(folder: Path) -> list[dict[str, str]]:
-        return [{title(found[page]): page} for page in listed if Path(page).parent == folder]
+        return [entry(page) for page in listed if Path(page).parent == folder]
 
     docs = Path("docs")
+    sections = {name: entries(docs / folder) for name, folder in SECTIONS.items()}
+    sections["Background"] = [*map(entry, RULES), *sections["Background"]]
     return [
         {"Dwell": "README.md"},
-        {"Documentation": "docs/index.md"},
-        {"Contracts": [{title(found[page]): page} for page in CONTRACTS]},
-        *({name: entries(docs / folder)} for name, folder in SECTIONS.items()),
+        {"All pages": "docs/index.md"},
+        *({name: pages} for name, pages in sections.items()),
         {"Laboratory": entries(Path("lab/docs"))},
         {"Evidence": entries(Path("reproduction/evidence"))},
     ]
@@ -133,6 +137,7 @@ def settings(found: dict[str, str]) -> dict[str, object]:
         "docs_dir": SOURCE.name,
         "site_dir": SITE.name,
         "use_directory_urls": False,
+        "extra_css": [STYLES],
         "theme": {
             "font": False,
             "features": ["navigation.sections", "search.highlight"],

@@ -25,8 +25,8 @@ VERSIONS = ("3.11", "3.12", "3.13", "3.14")
 PLATFORMS = ("manylinux_2_17_x86_64", "manylinux_2_17_aarch64")
 PINS = ROOT / "requirements" / "runtime.txt"
 BLOCK = re.compile(r"^```(?:sh|console)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-#: Commands of README that a stranger's way leaves out: they take minutes, or need a wheel.
-LEFT_OUT = ("uv build", "make test", "make demo")
+#: Commands of README that a stranger's way leaves out: they take minutes.
+LEFT_OUT = ("make test", "make demo")
 #: Variables of a computer by which it reaches a package index.
 REACHES_INDEX = re.compile(r"SSL_CERT_|PIP_|UV_|(?:https?|no)_proxy$", re.IGNORECASE)
 
