@@ -16,11 +16,12 @@ NAMES: Mapping[str, Mapping[str, str]] = {
         "simulate_fleet Run Realisation DwellError",
     },
     "Compare": {
-        "dwell.study": "compare Contender Comparison load_study run_study open_study capacity_of",
+        "dwell.study": "compare Contender Comparison load_study run_study open_study Hindsight "
+        "paired_difference paired_median Family under keeps capacity_of",
         "dwell.report": "run_html comparison_html study_html",
     },
     "Extend": {
-        "dwell.model": "Problem Placement QoS Objective Weights Targets Caps",
+        "dwell.model": "Problem evolve Placement QoS Objective Weights Targets Caps",
         "dwell.cost": "cost hamming",
         "dwell.policies": "check_policy DTP ATP Cusum LatencyFirst WorkFunction Replicate Static",
         "dwell.estimators": "Profile Shadow Scaling Corrected",
@@ -29,9 +30,9 @@ NAMES: Mapping[str, Mapping[str, str]] = {
 }
 TEXT = """# Which Python names may I use?
 
-These names. Until 1.0 their arguments may change; the [changelog](../../CHANGELOG.md) names each
-change. All other names are internal. `help(dwell.load)` and the site show each docstring.
-`python -m docs.api` writes this page.
+These names, and [`dwell.ros2`](../howto/ros2.md#payloads); all others are internal. Until 1.0 their
+arguments may change; the [changelog](../../CHANGELOG.md) names each change. `help(dwell.load)` and
+the site show each docstring. `python -m docs.api` writes this page.
 """
 
 
