@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 import dwell
-from docs import units as units_page
 from dwell.live.commands.units import escaped_name, unit_texts, verify
 from dwell.live.wire.wiring import wire
 from tests.cli.live_cell import RealCell
@@ -99,10 +98,6 @@ def test_an_unknown_node_is_refused(tmp_path: Path) -> None:
     refused = call("live", "units", CELL, "--node", "R9", "--out", tmp_path / "units")
     assert_refused(refused, "no node 'R9' in cell 'light-follower'; there are R1, E, R2")
     assert not (tmp_path / "units").exists()
-
-
-def test_the_page_of_units_is_the_generated_one() -> None:
-    assert units_page.PAGE.read_text(encoding="utf-8") == units_page.page()
 
 
 def test_agents_and_controllers_report_to_systemd(
