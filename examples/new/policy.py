@@ -1,4 +1,4 @@
-"""A policy of your own: `dwell run cell.yaml --policy policy:Patient` plays it."""
+"""A policy of your own: `dwell run cell.yaml --policy policy:Patient` simulates it."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dwell.model import Problem, QoS
 
 
 class Patient:
-    """Move to the candidate that should miss the fewest deadlines, once it has stayed the best."""
+    """Move to the candidate with the fewest expected misses, if it is the best several times."""
 
-    # Change: what makes it move, and how long it waits. It may have an estimator, too:
-    # `--policy policy:Patient+corrected`.
+    # Change: the condition of a move, and how long it waits. `--policy policy:Patient+profile`
+    # selects another estimator than the cell's.
     def __init__(self, initial: str = "LOC", patience: int = 3) -> None:
         self.incumbent = initial
         self.patience = patience  # decisions at which another candidate must be the best
@@ -19,13 +19,13 @@ class Patient:
 
     @classmethod
     def from_problem(cls, problem: Problem) -> Patient:
-        """Make it for a cell: what the cell file says is in `problem`."""
+        """Make it for a cell; `problem` has the values of the cell file."""
         return cls(problem.initial)
 
     def decide(self, *, observed: QoS, estimates: Mapping[str, QoS]) -> str:
         """Choose the placement for the next window, by name.
 
-        `observed` is what the last window showed, `estimates` what it would have shown under each
+        `observed` has the metrics of the last window, `estimates` the expected metrics of each
         candidate: l95_ms, violation_rate, utilisation (by node).
         """
         best = min(estimates, key=lambda name: estimates[name].violation_rate)
@@ -38,5 +38,5 @@ class Patient:
         return self.incumbent
 
     def adopt(self, name: str) -> None:
-        """Take note that the guard, or an operator, has moved the cell."""
+        """Continue from another placement: the guard or an operator has moved the cell."""
         self.incumbent, self.better = name, []

@@ -12,13 +12,13 @@ POLICY = "policy:Patient"  # change: the name of your class
 
 
 def test_the_policy_keeps_to_the_rules() -> None:
-    """No window, however awkward, makes it fail or name what is no candidate."""
+    """Extreme windows do not make it fail, or return a name that is no candidate."""
     problem = dwell.load(CELL)
     assert check_policy(by_name(POLICY, problem), problem) == ()
 
 
 def test_the_policy_runs_the_cell() -> None:
-    """Every scenario of the cell is played; the same seed gives the same run."""
+    """It runs in every scenario; the same seed gives the same run."""
     problem = dwell.load(CELL)
     windows = problem.warmup_windows + 5
     for scenario in problem.scenarios:
@@ -28,7 +28,7 @@ def test_the_policy_runs_the_cell() -> None:
         )
         assert set(run.windows["placement"]) <= set(problem.candidates)
         assert run.decisions.equals(again.decisions)
-        # Change: what your cell must keep to, as
+        # Change: add the bounds of your cell, as
         # assert run.windows["violation_rate"].mean() < 0.05
 
 
