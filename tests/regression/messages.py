@@ -88,7 +88,7 @@ def _whole(texts: dict[str, list[str]]) -> Iterator[str]:
 
 def _python(cases: list[str]) -> Iterator[str]:
     """Yield what is said of expressions."""
-    classes = {name: getattr(model, name) for name in model.__all__}
+    classes = {name: getattr(model, name) for name in dir(model)}
     examples = {
         "canonical": dwell.load("canonical.yaml"),
         "fan_in": dwell.load("fan-in.yaml"),
