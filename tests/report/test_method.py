@@ -113,7 +113,7 @@ def test_rates_chains_and_all_terms_of_the_cost_are_told() -> None:
     assert told["every n cycles"] == "camera 10; detect 10"
     assert told["sampled"] == "detect → control"
     assert told["chains"] == "see-act: camera to control, at most 150 ms"
-    for term in ("L95 of the age of see-act / 7 ms", "2 · age / 80 ms"):
+    for term in ("L95 of the age of see-act / 150 ms", "2 · age / 80 ms"):
         assert term in told["cost"]
     assert "3 · price of bytes / 0.5 /h" in told["cost"]
     assert told["caps"] == "at most 1 miss in 20 cycles"
