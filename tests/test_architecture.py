@@ -97,7 +97,7 @@ def test_names_of_public_classes_are_unique() -> None:
 #: entry points of classes (rows of the registries, other packages' declarations), and those that
 #: import a user's modules or packages of others. Everything else imports in so many words.
 BY_NAME = {
-    *("__init__", "estimators/__init__", "model/__init__", "policies/__init__"),
+    *("__init__", "control/__init__", "estimators/__init__", "model/__init__", "policies/__init__"),
     *("record/__init__", "report/__init__", "sim/__init__", "study/__init__"),
     "model/entry_points",
     *("calibration/target", "live/stage", "model/user_classes"),

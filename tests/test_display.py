@@ -26,7 +26,6 @@ from dwell.control import (
     LookedAt,
     Presence,
     Probation,
-    ShadowPlan,
 )
 from dwell.display import Displayed, milliseconds
 from dwell.estimators import Evidence, Instants
@@ -39,6 +38,7 @@ from dwell.model import (
     TraceTable,
 )
 from dwell.model.fleet import Fleet, FleetEntry
+from dwell.model.shadow_plan import ShadowPlan
 from dwell.policies import by_name as policy_by_name
 from dwell.policies.registry import REGISTRY as POLICIES
 from dwell.record import Journal

@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import dwell
-from dwell.control import shadow_stamps
 from dwell.estimators import Evidence
 from dwell.kernels.advance import play as advance_to_end
 from dwell.kernels.arrays import lay_out
@@ -44,6 +43,7 @@ from dwell.model import (
     Task,
     Uniform,
 )
+from dwell.model.shadow_plan import shadow_stamps
 from tests.cells.generated import MS, Scheduler, make_problem, make_realisation
 from tests.cells.many import many
 from tests.reference.simulator import ITSELF, SHADOW, shadow_stamp, simulate

@@ -16,7 +16,6 @@ from dwell.control import (
     Evidence,
     LookedAt,
     MinimalPolicy,
-    ShadowPlan,
     plain_rule,
 )
 from dwell.errors import SimulationError
@@ -30,7 +29,7 @@ from dwell.model import Problem
 from dwell.model.document import to_document
 from dwell.model.fabric import resources_of
 from dwell.model.progress import Progress
-from dwell.model.shadow_plan import alternatives
+from dwell.model.shadow_plan import ShadowPlan, alternatives
 from dwell.model.table_columns import require_apart
 from dwell.model.window_close import close_after_ns
 from dwell.record import Run

@@ -9,13 +9,13 @@ from dataclasses import replace
 import pytest
 from msgspec.structs import replace as replaced
 
-from dwell.control import shadow_stamps
 from dwell.estimators import Corrected
 from dwell.live.roles.run_rows import Rows
 from dwell.live.wire import channels
 from dwell.live.wire.messages import Answer, Ask, Order, Stamped, decode, encode
 from dwell.live.wire.transport import Arrival
 from dwell.model import Problem
+from dwell.model.shadow_plan import shadow_stamps
 from tests.live.memory_transport import Clock
 from tests.live.small_world import MS, Alternating, World, canonical, columns
 

@@ -9,7 +9,7 @@ from typing import Protocol
 
 from msgspec.structs import asdict
 
-from dwell.control import CellGuard, shadow_stamps
+from dwell.control import CellGuard
 from dwell.errors import LiveError
 from dwell.live.roles.control_group import UNKNOWN
 from dwell.live.roles.latencies import Intervals
@@ -35,7 +35,7 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.routing import STAMPER, Destination, Routes
 from dwell.live.wire.transport import Arrival
 from dwell.model.instants import NEVER_NS
-from dwell.model.shadow_plan import alternatives
+from dwell.model.shadow_plan import alternatives, shadow_stamps
 
 #: Time without orders after which another controller may take over.
 LEASE_NS = 1_000_000_000
