@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 
@@ -11,9 +12,9 @@ import polars.testing
 import pytest
 
 from dwell.model import Caps, Chain, MissCap, Problem, Targets, Weights
-from tests.live.rated_cells import SLOW, sampling, world_of
+from tests.live.rated_cells import P_MS, SLOW, rated, sampling, world_of
 from tests.live.replayed import SYNCHRONOUS, Clocks, messages_of, recorded, replay, simulate
-from tests.live.small_world import Staying, canonical, columns
+from tests.live.small_world import Alternating, Staying, World, canonical, columns
 
 
 def aged(problem: Problem, latency: str | None) -> Problem:
@@ -103,3 +104,55 @@ def test_the_headline_names_the_chain_whose_data_are_too_old() -> None:
     assert world.status["health"] == "degraded"
     assert "see-act's max_age_ms (40)" in world.status["headline"]
     assert "feel" not in world.status["headline"]
+
+
+def test_a_recorded_age_without_a_picture_counts_from_the_picture_before() -> None:
+    chains = {"see-act": {"from": "camera", "to": "act"}}
+    problem = aged(sampling(chains=chains), "see-act")
+    world = world_of(problem, policy=Staying())
+    world.run(400)
+    # The first jobs of a restarted worker have no picture.
+    world.kill("control@R")
+    world.start("control@R")
+    world.run(800)
+    rows = columns(world, "cycles", "release_ns", "chain_latency_ns", "chain_age_ns")
+    known = [row for row in rows if row[1] is not None]
+    (first_ns, first_age_ns), *_ = [(at + after, age) for at, after, age in known]
+    assert first_age_ns == first_ns
+    ages_ms = [age / 1e6 for _, _, age in known]
+    # In a cycle the age grows by a period, or there is a newer picture.
+    grown = [later - before for before, later in pairwise(ages_ms)]
+    newer = -(SLOW - 1) * P_MS
+    assert {round(step / P_MS) * P_MS for step in grown} == {P_MS, newer}
+
+
+def by_window(problem: Problem) -> Problem:
+    """Return a cell that decides at the end of each window."""
+    controller = replace(problem.controller, decide_cycles=problem.window_cycles)
+    return replace(problem, controller=controller)
+
+
+def test_data_that_are_too_old_count_between_windows() -> None:
+    chains = {"see-act": {"from": "camera", "to": "act", "max_age_ms": 50}}
+    world = world_of(by_window(sampling(chains=chains)), policy=Staying())
+    world.run(795)
+    world.pin("AWAY")
+    world.run(800)
+    rows = columns(world, "cycles", "number", "lead", "missed")[SLOW:]
+    lead = [missed for number, lead, missed in rows if lead and not number % SLOW]
+    assert lead == [True] * len(lead)
+    assert len(lead) >= 2
+
+
+def test_a_reaction_that_ends_before_a_window_does_not_count_in_it() -> None:
+    chains = {"fuse": {"from": "lidar", "to": "arm"}}
+    problem = by_window(rated(idle=True, chains=chains))
+    # Some commands take effect after the end of their window.
+    exec_ms = dict.fromkeys(problem.pipeline.tasks, 1.0) | {"fuse": 18.0}
+    world = World(problem, exec_ms=exec_ms, policy=Alternating("LOC", "EDGE"))
+    world.run(3_000)
+    names = "lead", "reaction_l95_fuse"
+    windows = columns(world, "windows", *names)
+    # No command falls in the single cycle between two windows.
+    assert sum(lead == 1 for lead, _ in windows) > 5
+    assert max(after_ms for _, after_ms in windows) < 1.5 * SLOW * P_MS

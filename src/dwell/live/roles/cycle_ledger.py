@@ -117,6 +117,8 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
         Row in the record; -1 until the cycle is recorded.
     over_age : bool
         Whether the data of an actuation in it were too old, as known at the end of its window.
+    acted_ns : tuple of int, or None
+        Latency and data age at the actuation of the chain `objective.latency`.
     close_ns : int or None
         End of its window since the origin; None for a cycle outside windows.
     """
@@ -148,6 +150,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     row: int = -1
     window: int | None = None
     over_age: bool = False
+    acted_ns: tuple[int, int] | None = None
     close_ns: int | None = None
     outcome: str = ""
     shifts: dict[str, Shift] = {}

@@ -106,14 +106,18 @@ class DataAges:
     def judge(
         self, cycles: Sequence[LiveCycle], close_ns: int, known: Mapping[str, KnownOrigins]
     ) -> None:
-        """Mark the cycles in which an actuation before the end of their window was over age."""
-        bounded = {n: one for n, one in self._chains.items() if one.is_bounded}
-        for cycle in cycles if bounded else ():
-            cycle.over_age = False
-        for name, chain in bounded.items():
+        """Set the age in J of some cycles, and whether data were over age by `close_ns`."""
+        for cycle in cycles if self._chains else ():
+            cycle.over_age, cycle.acted_ns = False, None
+        for name, chain in self._chains.items():
+            if not (chain.is_bounded or name == self._latency):
+                continue
             for one in self._actuations(name, cycles, known.get(name, KnownOrigins())):
-                if one.at_ns <= close_ns:
-                    cycles[one.place].over_age |= one.age_ns > chain.max_age_ns
+                cycle = cycles[one.place]
+                if chain.is_bounded and one.at_ns <= close_ns:
+                    cycle.over_age |= one.age_ns > chain.max_age_ns
+                if name == self._latency:
+                    cycle.acted_ns = one.at_ns - cycle.at_ns, one.age_ns
 
     def values(self, cycles: Sequence[LiveCycle], known: Mapping[str, KnownOrigins]) -> Values:
         """Return the columns of a window; `known` as it was before the window."""
@@ -195,13 +199,8 @@ class DataAges:
         """Return the columns of a cycle, if a chain counts as latency."""
         if self._latency is None:
             return {}
-        known = self.known.get(self._latency, KnownOrigins())
-        acted = self._actuations(self._latency, [cycle], known)
-        latency_ns = acted[0].at_ns - cycle.at_ns if acted else None
-        return {
-            "chain_latency_ns": latency_ns,
-            "chain_age_ns": acted[0].age_ns if acted else None,
-        }
+        latency_ns, age_ns = cycle.acted_ns or (None, None)
+        return {"chain_latency_ns": latency_ns, "chain_age_ns": age_ns}
 
     def _actuations(
         self, name: str, cycles: Sequence[LiveCycle], known: KnownOrigins

@@ -20,6 +20,7 @@ which no sink is due count in windows, but not in their metrics.
 from __future__ import annotations
 
 import bisect
+from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -38,6 +39,7 @@ from dwell.live.roles.stage_counts import StageTable
 from dwell.live.roles.symptoms import Symptoms
 from dwell.live.wire.messages import Completion, Load, Stamp, Stamped
 from dwell.model import Problem
+from dwell.model.instants import NEVER_NS
 from dwell.model.window_close import window_close_ns
 
 #: Largest error bound of latencies in a proven window, as a share of D.
@@ -131,7 +133,7 @@ class LiveWindows:
         self._left: tuple[int, int] | None = None
         # The term of the guard's last move, and the term that the controller knows.
         self._fell = self._entered = (0, 0)
-        self._lead = 0
+        self._lead, self._led = 0, deque[LiveCycle](maxlen=KEPT_CYCLES)
         self._next_window = resume.window
 
     # ------------------------------------------------------------------------ messages
@@ -456,6 +458,7 @@ class LiveWindows:
         self._symptoms.closed(last)
         self._next_window += 1
         self._lead = 0
+        self._led.clear()
         return last, closed
 
     def _look(self, begin: int, end: int) -> tuple[LiveWindow, ClosedWindow]:
@@ -491,7 +494,8 @@ class LiveWindows:
         shadows, earlier = sends_shadows(self._controller), self._earlier(cycles[0])
         of_cycles = partial(self._ledger.evidence, cycles, release_ns, close_ns)
         known, ages = told(cycles), self.record.ages
-        ages.judge(cycles, close_ns, ages.known)
+        # Cycles of closed windows are judged by the end of their window.
+        ages.judge([one for one in cycles if one.row < 0], close_ns, ages.known)
         ages_ns, age_ms = ages.seen(self._recent(cycles), cycles, close_ns)
         return ClosedWindow(
             latency_ns=np.array([cycle.latency_ns for cycle in known], np.int64),
@@ -541,6 +545,7 @@ class LiveWindows:
             span_ns=beyond_ns - cycles[0].at_ns,
             close_ns=closed.close_ns,
             lead=self._lead,
+            led=tuple(self._led),
             heard=sum(cycle.heard for cycle in cycles),
             bound_ns=bound_ns,
             unproven=bound_ns > self._proven_ns or any(cycle.untold for cycle in cycles),
@@ -567,8 +572,11 @@ class LiveWindows:
             self._ledger.settle(cycle)
         self._symptoms.led(lead)
         if lead:
-            self.record.ages.closed(lead)
-        self._lead += max(end - self._window.at, 0)
+            ages = self.record.ages
+            ages.judge(lead, NEVER_NS, ages.known)
+            ages.closed(lead)
+        self._lead += len(lead)
+        self._led += lead
         self._take_off(end)
 
     def _take_off(self, end: int) -> None:

@@ -59,6 +59,8 @@ class LiveWindow:
         End of the window since the origin.
     lead : int
         Number of cycles between the previous window and this one.
+    led : sequence of LiveCycle
+        The last of these cycles.
     heard : int
         Number of cycles with a known stamp. The controller misses a decision if less than
         half of its cycles are known (`Controller.miss`).
@@ -83,6 +85,7 @@ class LiveWindow:
     span_ns: int
     close_ns: int
     lead: int
+    led: Sequence[LiveCycle]
     heard: int
     bound_ns: int
     unproven: bool
@@ -233,7 +236,7 @@ class RunRows:
                 self._changed[row] = cycle
         for number in self._changed_windows & self._windows.keys():
             window = self._windows[number]
-            self.ages.judge(window.cycles, window.close_ns, window.known_origins)
+            self.ages.judge(window.cycles, window.close_ns, self._origins_before(window))
         decided = (decision_values(self._controller, row) for row in self._controller.decisions)
         values: dict[str, Iterable[Values]] = {
             "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
@@ -299,11 +302,7 @@ class RunRows:
 
     def _window_values(self, window: LiveWindow) -> Values:
         cycles, names = window.cycles, self._controller.resources
-        before = self._windows.get(window.number - 1)
-        known = window.known_origins
-        # Cycles between the windows are not kept.
-        if before is not None and not window.lead:
-            known = self.ages.after(before.cycles, before.known_origins)
+        known = self._origins_before(window)
         busy, _, by_shadows = window.used.tolist()
         seen_l95_ms, seen_violation_rate, cost = map(_known, window.seen)
         seen_age_ms = None if seen_l95_ms is None else window.age_ms
@@ -342,6 +341,13 @@ class RunRows:
                 for name, share in zip(names, by_shadows, strict=True)
             }
         return values
+
+    def _origins_before(self, window: LiveWindow) -> Mapping[str, KnownOrigins]:
+        """Return the origins of the actuations before a window, by chain, as known now."""
+        before = self._windows.get(window.number - 1)
+        if before is None:
+            return window.known_origins
+        return self.ages.after([*before.cycles, *window.led], before.known_origins)
 
     def _overtaken(self, cycles: Sequence[LiveCycle]) -> int:
         """Return how many cycles of a window completed after a later cycle."""
