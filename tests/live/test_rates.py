@@ -16,6 +16,7 @@ import pytest
 import dwell
 from dwell.estimators import Evidence
 from dwell.estimators.measured import Message, Meter
+from dwell.live.roles.run_rows import columns_of
 from dwell.live.wire import channels
 from dwell.live.wire.messages import State, decode
 from dwell.live.wire.transport import Arrival
@@ -59,6 +60,19 @@ def test_idle_cycles_are_recorded_and_count_in_no_metric() -> None:
     assert all(rate == 0 and 3 < l95_ms < 6 and not proven for rate, l95_ms, proven in windows)
     assert {*columns(world, "decisions", "reason")} == {("hold",)}
     assert (world.status["health"], world.status["headline"]) == ("ok", None)
+
+
+def test_jobs_that_send_no_message_are_known() -> None:
+    world = world_of(rated(idle=True), policy=Staying(), jobs=True)
+    world.run(1_000)
+    jobs = [row for row in world.recorder.rows["jobs"] if row[1] == "imu"]
+    rows = [int(str(row[0])) for row in jobs]
+    assert steps(rows) == {1}
+    assert len(rows) > 50
+    order = list(columns_of(world.cell.controller, jobs=True)["jobs"])
+    assert {row[order.index("outcome")] for row in jobs} == {"done"}
+    # Their work is the cell's own.
+    assert all(row[order.index("cpu_ns")] is not None for row in jobs)
 
 
 def test_cycles_that_a_later_cycle_of_a_faster_sink_overtakes_are_counted() -> None:

@@ -488,9 +488,11 @@ class Worker:
                 place.transport.put(place.keys.of(channels.COMMAND, self.task), data, head)
         elif job.shadow or runs_here:
             if not job.shadow and self.copies.is_done(stamp):
+                destinations = ()
+            if not (job.shadow or destinations):
+                # No message tells of this job.
                 ended = Completion(stamp, self.task, ended_ns, CANCELLED, hops, place.node)
                 place.send(channels.ENDED, ended)
-                destinations = ()
             for target in destinations:
                 self._send(target, stamp, data, head, ended_ns)
             self.transfer.plan_checkpoint(job, ended_ns)

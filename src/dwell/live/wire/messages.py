@@ -25,6 +25,7 @@ STALE = "stale"
 SAMPLED = "sampled"
 #: Outcomes in a cycle with two copies: of a message that arrives after the other copy's, or after
 #: the cycle is done, and of a job that does not run, or sends nothing, because the cycle is done.
+#: A job that sends nothing because no message of its cycle is due has the second one, too.
 LATE, CANCELLED = "late", "cancelled"
 #: Outcome of a command that the gate stops, because it has passed a later cycle's command.
 BEHIND = "behind"
