@@ -126,6 +126,21 @@ def test_a_recorded_age_without_a_picture_counts_from_the_picture_before() -> No
     assert {round(step / P_MS) * P_MS for step in grown} == {P_MS, newer}
 
 
+def test_a_decision_after_a_move_knows_the_picture_before_it() -> None:
+    chains = {"see-act": {"from": "camera", "to": "act", "max_age_ms": 100}}
+    world = world_of(sampling(chains=chains), policy=Staying())
+    world.network.cut(key=f"{world.keys.root}/value/**")
+    world.run(1_000)
+    # A window ends every 20 cycles; the first jobs after a move have no picture.
+    for placement in ("AWAY", "LOC") * 3:
+        world.pin(placement)
+        world.run(150)
+    assert len(world.stamper.moves) == 6
+    seen = columns(world, "decisions", "seen_violation_rate")
+    assert {*seen} == {(0.0,)}
+    assert len(seen) > 20
+
+
 def by_window(problem: Problem) -> Problem:
     """Return a cell that decides at the end of each window."""
     controller = replace(problem.controller, decide_cycles=problem.window_cycles)

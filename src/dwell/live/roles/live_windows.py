@@ -495,7 +495,7 @@ class LiveWindows:
         of_cycles = partial(self._ledger.evidence, cycles, release_ns, close_ns)
         known, ages = told(cycles), self.record.ages
         # Cycles of closed windows are judged by the end of their window.
-        ages.judge([one for one in cycles if one.row < 0], close_ns, ages.known)
+        ages.judge(self._line[self._window.at : end], close_ns, ages.known)
         ages_ns, age_ms = ages.seen(self._recent(cycles), cycles, close_ns)
         return ClosedWindow(
             latency_ns=np.array([cycle.latency_ns for cycle in known], np.int64),
