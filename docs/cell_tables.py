@@ -22,6 +22,7 @@ from dwell.cellfile.forms import (
     TextForm,
     WrittenForm,
 )
+from dwell.model.declaration import KeyTier
 from dwell_lab.testbed import inventory
 
 FOLDER = Path(__file__).parent / "reference"
@@ -61,7 +62,9 @@ SHAPES: Mapping[str, Shape | tuple[Shape, Shape]] = {
     "a real host": inventory.HOST,
     "link commands": inventory.LINK,
 }
-HEAD = "| key | value | default | tier | meaning |", "|---|---|---|---|---|"
+HEAD = "| key | value | default | meaning |", "|---|---|---|---|"
+#: Marks around the keys of a tier.
+MARKS: Mapping[KeyTier, str] = {"first": "**", "tuning": "", "measured": "*"}
 PLACE = re.compile(r"<!-- keys of ([^\n]*) -->\n(?:\|[^\n]*\n)*")
 
 
@@ -79,7 +82,8 @@ def _table(name: str) -> str:
 
 
 def _row(key: FormKey) -> str:
-    return f"| `{key.named}` | {_value(key)} | {_usual(key)} | {key.tier} | {key.says} |"
+    mark = MARKS[key.tier]
+    return f"| {mark}`{key.named}`{mark} | {_value(key)} | {_usual(key)} | {key.says} |"
 
 
 def words(form: Form) -> str:

@@ -39,7 +39,7 @@ HEAD = """\
 #   objective           cost of a placement: weights, targets, caps
 #   controller.policy   the policy: `policy:Patient` is the class in policy.py
 {more}
-# Keys of the tier `first`; docs/reference/cells.md lists all keys by tier:
+# Keys for a first cell; docs/reference/cells.md lists all keys:
 {keys}
 # `dwell check cell.yaml` finds every fault; `python test_cell.py` simulates the cell.
 """
