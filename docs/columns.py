@@ -28,7 +28,7 @@ WORDS = {
 }
 #: Begin of the text that is not written by hand.
 FIRST = "The last column has the reasons of null:"
-HEAD = "| column | type | unit | meaning | null |\n|---|---|---|---|---|\n"
+HEAD = "| column | type | meaning | null |\n|---|---|---|---|\n"
 
 
 def tables() -> str:
@@ -54,7 +54,8 @@ def _row(column: Column) -> str:
     null = column.null
     for word, reason in WORDS.items():
         null = null.replace(reason, f"*{word}*")
-    cells = (f"`{name}`{tables}", column.kind, column.unit, column.sentence, null)
+    kind = f"{column.kind}, {column.unit}" if column.unit else column.kind
+    cells = (f"`{name}`{tables}", kind, column.sentence, null)
     return f"| {' | '.join(cells)} |\n"
 
 
