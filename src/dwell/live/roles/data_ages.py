@@ -77,7 +77,7 @@ class DataAges:
         self._sinks, self._rates = frozenset(pipeline.sinks), pipeline.rates
         self._period_ns, self._censor_ms = pipeline.period_ns, problem.censor_ms
         self._latency, self._weighs_age = objective.latency, objective.weighs_age
-        self.known: Mapping[str, KnownOrigins] = {}
+        self.known: Mapping[str, KnownOrigins] = dict.fromkeys(self._chains, KnownOrigins())
 
     @property
     def reach_ns(self) -> int:
@@ -94,10 +94,10 @@ class DataAges:
         """Return the origins known after a window; `known` as it was before the window."""
         found: dict[str, KnownOrigins] = {}
         for name in self._chains:
-            before = known.get(name, KnownOrigins())
+            before = known[name]
             acted = self._actuations(name, cycles, before)
-            cycles_known = [one.newest for one in acted if one.newest is not None]
-            newest = max((*cycles_known, *_some(before.newest)), default=None)
+            ends = before.newest, *(one.newest for one in acted)
+            newest = max((one for one in ends if one is not None), default=None)
             later = {one.number: one.at_ns for one in cycles if one.number >= (newest or 0)}
             oldest_ns = acted[-1].born_ns if acted else before.oldest_ns
             found[name] = KnownOrigins(oldest_ns, newest, later)
@@ -112,7 +112,7 @@ class DataAges:
         for name, chain in self._chains.items():
             if not (chain.is_bounded or name == self._latency):
                 continue
-            for one in self._actuations(name, cycles, known.get(name, KnownOrigins())):
+            for one in self._actuations(name, cycles, known[name]):
                 cycle = cycles[one.place]
                 if chain.is_bounded and one.at_ns <= close_ns:
                     cycle.over_age |= one.age_ns > chain.max_age_ns
@@ -123,7 +123,7 @@ class DataAges:
         """Return the columns of a window; `known` as it was before the window."""
         found: dict[str, object] = {}
         for name, chain in self._chains.items():
-            before = known.get(name, KnownOrigins())
+            before = known[name]
             acted = self._actuations(name, cycles, before)
             ages_ns = _by_cycle(acted, len(cycles))[None]
             found[f"age_l95_{name}"] = float(age_l95_ms(ages_ns)[0])
@@ -178,8 +178,8 @@ class DataAges:
         """
         name, acted = self._latency, list[Actuation]()
         if name is not None:
-            known = self.known.get(name, KnownOrigins())
-            acted = [one for one in self._actuations(name, recent, known) if one.at_ns <= close_ns]
+            acted = self._actuations(name, recent, self.known[name])
+            acted = [one for one in acted if one.at_ns <= close_ns]
         elif self._weighs_age:
             done = [(place, one) for place, one in enumerate(recent) if one.latency_ns < NEVER_NS]
             acted = [Actuation(i, one.at_ns + one.latency_ns, one.at_ns, None) for i, one in done]
@@ -212,9 +212,8 @@ class DataAges:
         for at_ns, place, origin in sorted(timed, key=lambda one: one[:2]):
             if origin is not None:
                 born_ns = origin.released_ns - cycles[place].origin_ns
-            acted.append(
-                Actuation(place, at_ns, born_ns, None if origin is None else origin.newest)
-            )
+            newest = None if origin is None else origin.newest
+            acted.append(Actuation(place, at_ns, born_ns, newest))
         return acted
 
     def _actuation(self, chain: Chain, cycle: LiveCycle) -> tuple[int, Origin | None] | None:
@@ -242,7 +241,3 @@ def _by_cycle(acted: Iterable[Actuation], count: int) -> Ints:
     for one in acted:
         ages_ns[one.place] = one.age_ns
     return ages_ns
-
-
-def _some(value: int | None) -> tuple[int, ...]:
-    return () if value is None else (value,)
