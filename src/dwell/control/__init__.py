@@ -8,6 +8,7 @@ from dwell.control.plain_rule import plain_rule as plain_rule  # its module has 
 from dwell.estimators import Estimator as Estimator
 from dwell.estimators import Evidence as Evidence
 from dwell.estimators import Instants as Instants
+from dwell.estimators.evidence import NOT_DUE as NOT_DUE
 from dwell.policies import MinimalPolicy as MinimalPolicy
 
 # The names are in the stub; each is imported at its first use.

@@ -25,6 +25,7 @@ from .windows import overtaken_cycles as overtaken_cycles
 from .windows import reactions as reactions
 from .windows import seen_costs as seen_costs
 
+NOT_DUE: int
 Estimator = dwell.estimators.Estimator
 Evidence = dwell.estimators.Evidence
 Instants = dwell.estimators.Instants

@@ -334,8 +334,7 @@ class Observer:
             return
         if before is None or stamp.run != before.run:
             self._origin_ns = self._begin_ns(stamp, before)
-        idle = self._ledger.due.is_idle(stamp.cycle)
-        cycle = LiveCycle.of(stamp, self._origin_ns, idle=idle)
+        cycle = self._ledger.cycle_of(stamp, self._origin_ns)
         cycle.group_ns = stamp.group_ns
         self._open[cycle.key] = cycle
         self._newest = cycle, time.monotonic_ns()

@@ -23,28 +23,28 @@ class DueTasks:
         self.sources = tuple(name for name in pipeline.tasks if not pipeline.waited(name))
         self._sink_rates = pipeline.sink_rates
         self._pipeline = pipeline
-        self._intervals = sorted({self.rates[name] for name in pipeline.sinks})
+        self._intervals = sorted({*self.rates.values()} - {1})
         self._sinks: dict[tuple[bool, ...], frozenset[str]] = {}
 
     def runs(self, task: str, cycle: int) -> bool:
         """Whether a task is due in a cycle."""
         return cycle % self.rates[task] == 0
 
+    def pattern(self, cycle: int) -> tuple[bool, ...]:
+        """Return whether each rate above 1 is due in a cycle, which determines the due tasks."""
+        return tuple(cycle % rate == 0 for rate in self._intervals)
+
     def sends(self, flow: Flow, cycle: int) -> bool:
         """Whether a flow has a message in a cycle: a waited flow needs a target that is due."""
         return self.runs(flow.source if flow.sampled else flow.target, cycle)
 
     def sinks(self, cycle: int) -> frozenset[str]:
-        """Return the tasks without outputs that are due in a cycle."""
-        due = tuple(cycle % rate == 0 for rate in self._intervals)
+        """Return the tasks without outputs that are due in a cycle; none in an idle cycle."""
+        due = self.pattern(cycle)
         if due not in self._sinks:
             names = (name for name in self._pipeline.sinks if self.runs(name, cycle))
             self._sinks[due] = frozenset(names)
         return self._sinks[due]
-
-    def is_idle(self, cycle: int) -> bool:
-        """Whether no sink is due in a cycle."""
-        return not any(cycle % rate == 0 for rate in self._intervals)
 
     def is_needed(self, task: str, cycle: int) -> bool:
         """Whether waited flows lead from a task to a sink that is due, or it is such a sink."""

@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import dwell
-from dwell.live.roles.cycle_ledger import NOT_DUE, UNKNOWN, Ledger, LiveCycle
+from dwell.control import NOT_DUE
+from dwell.live.roles.cycle_ledger import UNKNOWN, Ledger, LiveCycle
+from dwell.live.roles.live_evidence import LiveEvidence
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wire.messages import Completion, Hop, Stamp
 from dwell.model import Problem
@@ -43,7 +45,8 @@ def stamp(number: int, placement: str = "SO", shadow: str = "") -> Stamp:
 
 
 def cycle(number: int = 0, *, placement: str = "SO", shadow: str = "") -> LiveCycle:
-    return LiveCycle.of(stamp(number, placement, shadow), 0)
+    who = 1, number, 1, placement, shadow
+    return LiveCycle(*who, RELEASE_NS, 0, heard=True, idle=False)
 
 
 CPU_NS = 2 * MS
@@ -128,7 +131,7 @@ def test_evidence_is_what_had_happened_at_the_close(ledger: Ledger, problem: Pro
     done.take(completion(done), None)
     close_ns = RELEASE_NS + 20 * MS
     release_ns = np.array([RELEASE_NS, RELEASE_NS])
-    found = ledger.evidence([done, silent], release_ns, close_ns, shadows=False)
+    found = LiveEvidence(problem, ledger).known([done, silent], release_ns, close_ns, shadows=False)
     tasks = list(problem.pipeline.tasks)
     ended = dict(zip(tasks, found.cycles.end_ns[0].tolist(), strict=True))
     assert ended == {
@@ -160,7 +163,7 @@ def test_what_is_not_due_in_a_cycle_is_not_due_in_its_shadow(problem: Problem) -
     ledger = Ledger(slow, Offsets("E", problem.stamper_node, system_bound_ns=0))
     both = [cycle(number, shadow="LOC") for number in (0, 1)]
     release_ns, close_ns = np.array([RELEASE_NS, RELEASE_NS]), RELEASE_NS + 20 * MS
-    found = ledger.evidence(both, release_ns, close_ns, shadows=True)
+    found = LiveEvidence(slow, ledger).known(both, release_ns, close_ns, shadows=True)
     assert found.shadows is not None
     for instants in (found.shadows.end_ns, found.shadows.arrived_ns):
         assert (instants[0] == UNKNOWN).all()
@@ -182,7 +185,11 @@ def test_work_on_an_accelerator_is_the_time_that_a_job_had_it(problem: Problem) 
     one = cycle()
     one.take(completion(one), None)
     close_ns = RELEASE_NS + 60 * MS
-    found = ledger.evidence([one], np.array([RELEASE_NS]), close_ns, shadows=False).cycles
+    found = (
+        LiveEvidence(accelerated, ledger)
+        .known([one], np.array([RELEASE_NS]), close_ns, shadows=False)
+        .cycles
+    )
     assert found.work_ns is not None
     assert found.work_ns[0].tolist() == [CPU_NS, 10 * MS, CPU_NS, CPU_NS]
 
@@ -240,7 +247,11 @@ def test_a_clock_that_is_set_within_a_cycle_leaves_no_interval_that_cannot_be(
     assert one.latency_ns >= 0
     ledger.jobs(one)
     release_ns = np.array([RELEASE_NS])
-    shown = ledger.evidence([one], release_ns, RELEASE_NS + 60 * MS, shadows=False).cycles
+    shown = (
+        LiveEvidence(PROBLEM, ledger)
+        .known([one], release_ns, RELEASE_NS + 60 * MS, shadows=False)
+        .cycles
+    )
     # The stamp of a source may have been there before the release.
     for instants in (shown.ready_ns[:, 1:], shown.end_ns, shown.arrived_ns):
         assert ((instants == UNKNOWN) | (instants >= RELEASE_NS - MS)).all()
@@ -275,7 +286,11 @@ def test_jobs_of_the_warm_up_are_no_evidence(ledger: Ledger, problem: Problem) -
     jobs = tuple(replace(one, warmup=one.task == "perception") for one in hops())
     warming.take(replace(completion(warming), hops=jobs), None)
     close_ns = RELEASE_NS + 40 * MS
-    found = ledger.evidence([warming], np.array([RELEASE_NS]), close_ns, shadows=False).cycles
+    found = (
+        LiveEvidence(problem, ledger)
+        .known([warming], np.array([RELEASE_NS]), close_ns, shadows=False)
+        .cycles
+    )
     assert found.start_ns is not None
     assert found.work_ns is not None
     column = list(problem.pipeline.tasks).index("perception")

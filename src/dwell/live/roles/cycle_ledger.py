@@ -1,8 +1,7 @@
-"""LiveCycle: the messages about one cycle; Ledger: latency, jobs and evidence from them.
+"""LiveCycle: the messages about one cycle; Ledger: latency and jobs from them.
 
 A job's instants travel with its output. If a cycle never arrives at a sink, its jobs are unknown,
-unless a worker reports that a newer cycle replaced it. The ledger then assumes that the first
-unconfirmed message between two nodes was lost.
+unless a worker reports that a newer cycle replaced it.
 """
 
 from __future__ import annotations
@@ -15,7 +14,6 @@ from typing import TypeAlias
 import msgspec
 import numpy as np
 
-from dwell.control import Evidence, Instants
 from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wire.messages import (
@@ -30,13 +28,12 @@ from dwell.live.wire.messages import (
     Hop,
     Stamp,
 )
+from dwell.live.wire.routing import Routes
 from dwell.live.wire.wiring import lane_of
 from dwell.model import Execution, Flow, Problem
-from dwell.model.due_tasks import DueTasks
 from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
-from dwell.model.number_arrays import Floats, Ints
-from dwell.model.placement import Copy, Replicas
+from dwell.model.number_arrays import Floats
 from dwell.record import Values
 
 #: Whether the job belongs to the shadow; task and node.
@@ -50,8 +47,6 @@ UNKNOWN = -1
 MAX_SHADOWS = 16
 #: Least share of a window in which a hook must have measured an accelerator.
 HOOKED_SHARE = 0.5
-#: Instant of a job or message in a cycle in which it is not due, or was cancelled.
-NOT_DUE = -2
 #: Outcomes of jobs that ended before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
 #: Outcomes of messages that begin no job whose output counts.
@@ -131,7 +126,7 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     at_ns: int
     origin_ns: int
     heard: bool
-    idle: bool = False
+    idle: bool
     stamped_ns: int | None = None
     group_ns: int = UNKNOWN
     reports: dict[str, Completion] = {}
@@ -155,13 +150,6 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     outcome: str = ""
     shifts: dict[str, Shift] = {}
 
-    @classmethod
-    def of(cls, stamp: Stamp, origin_ns: int, *, idle: bool = False) -> LiveCycle:
-        """Return the cycle of a stamp."""
-        at_ns = stamp.released_ns - origin_ns
-        who = stamp.run, stamp.cycle, stamp.term, stamp.placement, stamp.shadow
-        return cls(*who, at_ns, origin_ns, heard=True, idle=idle)
-
     @property
     def key(self) -> tuple[int, int]:
         """Run and cycle number, which order all cycles."""
@@ -170,16 +158,14 @@ class LiveCycle(msgspec.Struct, eq=False, gc=False):
     @property
     def hops(self) -> Iterator[Hop]:
         """Reported jobs of this cycle, not of its shadow; several sinks may report one job."""
-        for done in (*self.replaced.values(), *self.reports.values()):
-            yield from done.hops
-        for done in self.arrivals.values():
-            yield from _ended(done)
+        for done in self.all_reports:
+            yield from jobs_in(done)
 
     @property
     def all_reports(self) -> Iterator[Completion]:
         """Reports with jobs of this cycle, not of its shadow."""
-        yield from self.reports.values()
         yield from self.replaced.values()
+        yield from self.reports.values()
         yield from self.arrivals.values()
 
     @property
@@ -288,45 +274,47 @@ class Ledger:
     def __init__(self, problem: Problem, offsets: Offsets) -> None:
         pipeline = problem.pipeline
         self.sinks = frozenset(pipeline.sinks)
-        #: Tasks that run in each cycle.
-        self.due = DueTasks(pipeline)
+        self.routes = Routes(problem)
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
         self._stamper_node = problem.stamper_node
         self._nodes, self._resources = problem.fabric.nodes, problem.fabric.resources
         #: CPU and accelerator time by node.
         self.loads = {node: NodeLoad() for node in self._nodes}
-        self._tasks = {name: column for column, name in enumerate(pipeline.tasks)}
-        self._flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
+        self.tasks = {name: column for column, name in enumerate(pipeline.tasks)}
+        self.flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
         self._sampled = {(f.source, f.target) for f in pipeline.flows if f.sampled}
-        self._codes = {name: code for code, name in enumerate(problem.candidates)}
-        self._every = frozenset(pipeline.tasks)
-        #: Columns per task and flow in the evidence.
-        self._copies = 2 if problem.replicas else 1
+        self._has_copies = bool(problem.replicas)
         order = pipeline.topological()
-        self._forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
-        self._apart: dict[tuple[str, str], frozenset[str]] = {}
+        #: Flows in the order of their sources in the pipeline.
+        self.forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
         self._accelerated: dict[str, frozenset[str]] = {}
+
+    def cycle_of(self, stamp: Stamp, origin_ns: int, *, heard: bool = True) -> LiveCycle:
+        """Return the cycle of a stamp; without `heard`, of a stamp that its neighbours imply."""
+        who = stamp.run, stamp.cycle, stamp.term, stamp.placement, stamp.shadow
+        idle = not self.routes.due.sinks(stamp.cycle)
+        return LiveCycle(*who, stamp.released_ns - origin_ns, origin_ns, heard, idle)
 
     def tells(self, completion: Completion) -> bool:
         """Whether a completion's task can have its outcome: before a sink any task, else a sink."""
         early = completion.outcome in {SHADOW, REPLACED, *WITHOUT_JOB}
-        return completion.sink in (self._every if early else self.sinks)
+        return completion.sink in (self.tasks if early else self.sinks)
 
     # ------------------------------------------------------------------------ latency
 
     def complete(self, cycle: LiveCycle) -> bool:
         """Whether every due sink has reported a cycle; false for an idle cycle."""
-        return not cycle.idle and self.due.sinks(cycle.number) <= cycle.reports.keys()
+        return not cycle.idle and self.routes.due.sinks(cycle.number) <= cycle.reports.keys()
 
     def is_over(self, cycle: LiveCycle) -> bool:
         """Whether a cycle is complete or idle, and its sampled messages have arrived."""
         arrived = {(source, target) for source, target, _ in cycle.arrivals}
-        sampled = {flow for flow in self._sampled if self.due.runs(flow[0], cycle.number)}
+        sampled = {flow for flow in self._sampled if self.routes.due.runs(flow[0], cycle.number)}
         return (cycle.idle or self.complete(cycle)) and sampled <= arrived
 
     def is_replaced(self, cycle: LiveCycle) -> bool:
         """Whether a later cycle has replaced a job that a due sink waits for."""
-        return any(self.due.is_needed(task, cycle.number) for task, _ in cycle.replaced)
+        return any(self.routes.due.is_needed(task, cycle.number) for task, _ in cycle.replaced)
 
     def settle(self, cycle: LiveCycle, *, most_ns: int | None = None) -> None:
         """Compute latency and parts of a complete cycle.
@@ -344,7 +332,7 @@ class Ledger:
         cycle.told = False
         reports = cycle.reports.values()
         for done in reports:
-            self._doubt(cycle, done)
+            self.doubt(cycle, done)
         ends = [(self._since_origin(cycle, done.node, done.done_ns), done) for done in reports]
         done_ns, last = max(ends, key=lambda pair: pair[0])
         if cycle.stamped_ns is not None and len(cycle.heard_ns) == len(reports):
@@ -377,7 +365,7 @@ class Ledger:
         at_ns = self._since_origin(cycle, node, instant_ns)
         return at_ns if cycle.shifts[node].bound_ns < UNBOUNDED_NS else None
 
-    def _doubt(self, cycle: LiveCycle, done: Completion) -> None:
+    def doubt(self, cycle: LiveCycle, done: Completion) -> None:
         """Mark the clocks as not compared if a cycle's instants are impossible with them.
 
         Jobs end after the release and before their report arrives, messages arrive after they are
@@ -385,15 +373,15 @@ class Ledger:
         bounds, a clock was set after the last comparison.
         """
         known = [(done.node, done.done_ns)]
-        hops = _by_site(done.hops)
+        hops = by_site(done.hops)
         for hop in hops.values():
             if hop.ended_ns != UNKNOWN:
                 known.append((hop.node, hop.ended_ns))
                 if hop.ended_ns < hop.arrived_ns:
                     self._disbelieve(cycle, hop.node)
             for source, arrived_ns in hop.inputs:
-                sender = self._sender(cycle, hops, hop, source)
-                is_flow = (source, hop.task) in self._flows
+                sender = self.sender(cycle, hops, hop, source)
+                is_flow = (source, hop.task) in self.flows
                 if sender is None or sender.ended_ns == UNKNOWN or not is_flow:
                     continue
                 if sender.node == hop.node:
@@ -434,7 +422,7 @@ class Ledger:
         )
         return begin_ns, end_ns
 
-    def _sender(
+    def sender(
         self, cycle: LiveCycle, hops: Mapping[Site, Hop], hop: Hop, source: str
     ) -> Hop | None:
         """Return the job that sent an input of a job, of the same copy if there are two."""
@@ -445,7 +433,7 @@ class Ledger:
         # A guessed or repeated stamp has sent the cycle through other nodes, too.
         return next((one for one in reversed([*hops.values()]) if one.task == source), None)
 
-    def _is_second(self, cycle: LiveCycle, task: str, node: str) -> bool:
+    def is_second(self, cycle: LiveCycle, task: str, node: str) -> bool:
         """Whether a job belongs to the second copy of a cycle alone."""
         placed = self._candidates[cycle.placement]
         second = placed.second
@@ -457,7 +445,7 @@ class Ledger:
         The path runs backwards from the sink, to the input that arrived last at each job. Messages
         within a node count as queueing, and so do the ways to the first job and to the actuator.
         """
-        hops = _by_site(last.hops)
+        hops = by_site(last.hops)
         hop = hops.pop((last.sink, last.node), None)
         if hop is None:
             return None
@@ -465,7 +453,7 @@ class Ledger:
         while hop is not None:
             compute_ns += max(hop.ended_ns - hop.started_ns, 0)
             source, arrived_ns = max(hop.inputs, key=lambda given: given[1], default=("", 0))
-            sender = self._sender(cycle, hops, hop, source)
+            sender = self.sender(cycle, hops, hop, source)
             if sender is not None:
                 del hops[sender.task, sender.node]
             if sender is not None and sender.node != hop.node:
@@ -523,7 +511,7 @@ class Ledger:
         spent = Counter[str]()
         for cycle in cycles:
             # Several sinks may report one job.
-            for hop in {(hop.task, hop.node): hop for hop in cycle.hops}.values():
+            for hop in by_site(cycle.hops).values():
                 execution = self._execution(hop)
                 on_cpu = execution is not None and execution.accelerator is None
                 if hop.cpu_ns != UNKNOWN and on_cpu:
@@ -544,7 +532,7 @@ class Ledger:
                 if execution is None or execution.accelerator is None or hop.ended_ns == UNKNOWN:
                     continue
                 spent = shadow if is_shadow else own
-                spent[execution.resource(hop.node)] += self._work_ns(hop)
+                spent[execution.resource(hop.node)] += self.work_ns(hop)
         return {
             name: (
                 float(own[name]) if name in own or name not in placed else math.nan,
@@ -568,7 +556,7 @@ class Ledger:
         task = self._pipeline.tasks.get(hop.task)
         return None if task is None else task.on.get(hop.node)
 
-    def _work_ns(self, hop: Hop) -> int:
+    def work_ns(self, hop: Hop) -> int:
         """CPU time of a job that has ended, or its time on an accelerator; else `UNKNOWN`."""
         execution = self._execution(hop)
         if execution is None or hop.ended_ns == UNKNOWN:
@@ -580,19 +568,19 @@ class Ledger:
     def jobs(self, cycle: LiveCycle) -> list[Values]:
         """Return the rows of ``jobs`` for the known jobs of a cycle and its shadow."""
         jobs = self._jobs(cycle)
-        order = sorted(jobs, key=lambda key: (key[0], self._tasks[key[1]]))
+        order = sorted(jobs, key=lambda key: (key[0], self.tasks[key[1]]))
         rows = (self._job_values(cycle, jobs, key) for key in order)
         return [row for row in rows if row is not None]
 
     def _jobs(self, cycle: LiveCycle) -> Jobs:
         """Jobs of a cycle and its shadow."""
         jobs: Jobs = {}
-        apart = self._diverging(cycle) if cycle.shadow in self._codes else frozenset[str]()
+        apart = self.routes.apart(cycle.placement, cycle.shadow)
         hops = [(hop, False) for hop in cycle.hops]
-        ended = [hop for done in cycle.shadows for hop in self._ran(done)]
+        ended = [hop for done in cycle.shadows for hop in self.ran(done)]
         hops += [(hop, hop.task in apart) for hop in ended]
         for hop, shadow in hops:
-            if hop.task not in self._tasks or (shadow and hop.task in self.sinks):
+            if hop.task not in self.tasks or (shadow and hop.task in self.sinks):
                 continue
             known = jobs.get((shadow, hop.task, hop.node))
             if known is None or known.ended_ns == UNKNOWN:
@@ -618,9 +606,9 @@ class Ledger:
 
     def _job_values(self, cycle: LiveCycle, jobs: Jobs, key: JobName) -> Values | None:
         hop, shadow = jobs[key], key[0]
-        is_second = not shadow and self._is_second(cycle, hop.task, hop.node)
-        ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
-        if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
+        is_second = not shadow and self.is_second(cycle, hop.task, hop.node)
+        ready_ns = self.instant_ns(cycle, hop.node, hop.arrived_ns)
+        if ready_ns is None:
             return None
         if not self._pipeline.inputs(hop.task):
             # The stamp may have arrived before the cycle began.
@@ -645,202 +633,20 @@ class Ledger:
             ),
             "outcome": "done" if ended else "replaced",
             "shadow": shadow,
-            **({"second": is_second} if self._copies > 1 else {}),
+            **({"second": is_second} if self._has_copies else {}),
             **{name: ns if ended and ns != UNKNOWN else None for name, ns in counted_ns.items()},
         }
 
-    # ----------------------------------------------------------------------- evidence
+    # ----------------------------------------------------------------------- messages
 
-    def evidence(
-        self,
-        cycles: Sequence[LiveCycle],
-        release_ns: Ints,
-        close_ns: int,
-        *,
-        shadows: bool,
-        earlier: Sequence[LiveCycle] = (),
-    ) -> Evidence:
-        """Return the instants of a window's jobs and messages that are known at its end.
-
-        `shadows` tells whether the result has the shadows' instants. `earlier` are the cycles of
-        `Evidence.earlier`.
-        """
-        known, of_shadows = self._unknown(len(cycles)), self._unknown(len(cycles))
-        for tables in (known, of_shadows):
-            self._mark_not_due(tables, cycles)
-        through = np.full(len(cycles), -1, np.int64)
-        for row, cycle in enumerate(cycles):
-            if cycle.shadow in self._codes:
-                through[row] = self._codes[cycle.shadow]
-                apart = self._diverging(cycle)
-                for report in cycle.shadows:
-                    self._doubt(cycle, report)
-                    ran = self._ran(report)
-                    self._enter(of_shadows, row, cycle, ran, apart, shadow=True)
-                    # Jobs that the shadow shares with the cycle, whose own report may be missing.
-                    self._enter(known, row, cycle, ran, self._every - apart)
-                    if len(ran) < len(report.hops):
-                        self._enter_arrivals(of_shadows, row, cycle, report.hops[-1], ())
-            for report in (*cycle.replaced.values(), *cycle.reports.values()):
-                self._doubt(cycle, report)
-                self._enter(known, row, cycle, report.hops, self._every)
-            for report in cycle.arrivals.values():
-                self._doubt(cycle, report)
-                self._enter(known, row, cycle, _ended(report), self._every)
-                if report.hops and report.hops[-1].ended_ns == UNKNOWN:
-                    self._enter_arrivals(known, row, cycle, report.hops[-1], report.hops)
-            reported = cycle.deaf or cycle.reports or self.is_replaced(cycle) or cycle.told
-            if cycle.heard and not (reported or cycle.idle):
-                for copy in self._candidates[cycle.placement].copies:
-                    self._mark_lost(known, row, cycle, copy)
-        for tables in (known, of_shadows):
-            tables["work_ns"][tables["end_ns"] > close_ns] = UNKNOWN
-            for name in ("ready_ns", "start_ns", "end_ns", "arrived_ns"):
-                tables[name][tables[name] > close_ns] = UNKNOWN
-        for row, cycle in enumerate(cycles):
-            if cycle.at_ns + cycle.latency_ns <= close_ns:
-                self._mark_cancelled(known, row, cycle)
-        before = None
-        if earlier:
-            before_ns = np.array([cycle.at_ns for cycle in earlier], np.int64)
-            before = self.evidence(earlier, before_ns, close_ns, shadows=shadows)
-        return Evidence.of(
-            close_ns=close_ns,
-            release_ns=release_ns,
-            placement=np.array([self._codes[cycle.placement] for cycle in cycles], np.int64),
-            cycles=Instants(**known),
-            shadow_placement=through,
-            shadows=Instants(**of_shadows) if shadows else None,
-            # Agents run shadow jobs in the lowest scheduling class of the system.
-            shadows_share=False,
-            earlier=before,
-        )
-
-    def _unknown(self, cycles: int) -> dict[str, Ints]:
-        """Return the fields of `Instants`, filled with `UNKNOWN`."""
-        of_tasks, of_flows = (self._copies * len(of) for of in (self._tasks, self._flows))
-        columns = dict.fromkeys(("ready_ns", "start_ns", "end_ns", "work_ns"), of_tasks)
-        columns["arrived_ns"] = of_flows
-        return {name: np.full((cycles, n), UNKNOWN, np.int64) for name, n in columns.items()}
-
-    def _mark_not_due(self, known: Mapping[str, Ints], cycles: Sequence[LiveCycle]) -> None:
-        """Mark the jobs and messages of cycles, or shadows, in which they are not due."""
-        if not self._pipeline.has_rates:
-            return
-        numbers = np.array([cycle.number for cycle in cycles], np.int64)
-        of_tasks = np.array([self.due.rates[name] for name in self._tasks])
-        of_flows = np.array([*self._pipeline.message_rates.values()])
-        for name, instants in known.items():
-            rates = of_flows if name == "arrived_ns" else of_tasks
-            instants[numbers[:, None] % rates != 0] = NOT_DUE
-
-    def _enter(
-        self,
-        known: Mapping[str, Ints],
-        row: int,
-        cycle: LiveCycle,
-        hops: Iterable[Hop],
-        apart: frozenset[str],
-        *,
-        shadow: bool = False,
-    ) -> None:
-        """Enter instants and work of jobs, and the instants of the messages that reached them."""
-        hops = tuple(hops)
-        for hop in hops:
-            column = self._tasks.get(hop.task)
-            if column is None or hop.task not in apart:
-                continue
-            if not shadow:
-                column += len(self._tasks) * self._is_second(cycle, hop.task, hop.node)
-            ready_ns = self._since_origin(cycle, hop.node, hop.arrived_ns)
-            if cycle.shifts[hop.node].bound_ns >= UNBOUNDED_NS:
-                continue
-            shift_ns = ready_ns - hop.arrived_ns
-            if hop.ended_ns != UNKNOWN and not hop.warmup:
-                known["start_ns"][row, column] = max(hop.started_ns + shift_ns, 0)
-                known["end_ns"][row, column] = max(hop.ended_ns + shift_ns, 0)
-                known["work_ns"][row, column] = self._work_ns(hop)
-            # A shadow's last messages arrive at a sink whose job never runs.
-            if not hop.warmup and (hop.ended_ns != UNKNOWN or hop.task not in self.sinks):
-                known["ready_ns"][row, column] = max(ready_ns, 0)
-            self._enter_arrivals(known, row, cycle, hop, () if shadow else hops)
-
-    def _enter_arrivals(
-        self,
-        known: Mapping[str, Ints],
-        row: int,
-        cycle: LiveCycle,
-        hop: Hop,
-        hops: Sequence[Hop],
-    ) -> None:
-        """Enter the instants of the messages that reached a job.
-
-        `hops` are the senders' jobs, none for a shadow, which has one copy.
-        """
-        for source, arrived_ns in hop.inputs:
-            flow = self._flows.get((source, hop.task))
-            if flow is not None and self._copies > 1 and hops:
-                sender = self._sender(cycle, _by_site(hops), hop, source)
-                ends = [one for one in (sender, hop) if one is not None]
-                is_second = any(self._is_second(cycle, one.task, one.node) for one in ends)
-                flow += len(self._flows) * is_second
-            at_ns = self._since_origin(cycle, hop.node, arrived_ns)
-            if flow is not None and cycle.shifts[hop.node].bound_ns < UNBOUNDED_NS:
-                known["arrived_ns"][row, flow] = max(at_ns, 0)
-
-    def _ran(self, done: Completion) -> tuple[Hop, ...]:
+    def ran(self, done: Completion) -> tuple[Hop, ...]:
         """Return the jobs of a shadow, without the arrival of its output at a sampling task."""
         sampled = any((source, done.sink) in self._sampled for source in _arrived(done))
         return done.hops[:-1] if sampled else done.hops
 
-    def _mark_lost(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle, copy: Copy) -> None:
-        """Mark the first unconfirmed message of a copy between two nodes as lost."""
-        for flow in self._forward:
-            column = self._flow_column(cycle, flow, copy)
-            is_lost = known["arrived_ns"][row, column] < 0
-            if copy[flow.source] != copy[flow.target] and is_lost and self._loses(flow, cycle):
-                source, node = self._tasks[flow.source], copy[flow.source]
-                source += len(self._tasks) * self._is_second(cycle, flow.source, node)
-                known["arrived_ns"][row, column] = UNKNOWN
-                if known["end_ns"][row, source] < 0:
-                    known["end_ns"][row, source] = cycle.at_ns
-                return
-
-    def _flow_column(self, cycle: LiveCycle, flow: Flow, copy: Copy) -> int:
-        """Return the column of a flow in a copy of a cycle."""
-        ends = ((task, copy[task]) for task in (flow.source, flow.target))
-        is_second = any(self._is_second(cycle, *end) for end in ends)
-        return self._flows[flow.source, flow.target] + len(self._flows) * is_second
-
-    def _mark_cancelled(self, known: Mapping[str, Ints], row: int, cycle: LiveCycle) -> None:
-        """Mark what the slower copy of a cycle that is done has not done: it shows no loss.
-
-        A copy without any report is lost, unless the cycle was done before its hold ended.
-        """
-        placed = self._candidates[cycle.placement]
-        if not isinstance(placed, Replicas):
-            return
-        arrived = known["arrived_ns"][row]
-        arrived[arrived == UNKNOWN] = NOT_DUE
-        # A job that is ready has been replaced, and its copy lost.
-        unknown = (known["end_ns"][row] == UNKNOWN) & (known["ready_ns"][row] == UNKNOWN)
-        for name in ("ready_ns", "start_ns", "end_ns", "work_ns"):
-            known[name][row][unknown] = NOT_DUE
-        held_ns = 0, round(placed.after_ms * 1e6)
-        for copy, after_ns in zip(placed.copies, held_ns, strict=True):
-            flows = (flow for flow in self._forward if not self._is_shared(placed, flow))
-            columns = [self._flow_column(cycle, flow, copy) for flow in flows]
-            heard = self.complete(cycle) and not cycle.deaf
-            if heard and cycle.latency_ns > after_ns and (arrived[columns] < 0).all():
-                self._mark_lost(known, row, cycle, copy)
-
-    def _is_shared(self, placed: Replicas, flow: Flow) -> bool:
-        """Whether both copies share a flow's message."""
-        return {flow.source, flow.target}.isdisjoint(placed.doubled)
-
-    def _loses(self, flow: Flow, cycle: LiveCycle) -> bool:
+    def loses(self, flow: Flow, cycle: LiveCycle) -> bool:
         """Whether the loss of a flow's message loses a cycle."""
-        return not flow.sampled and self.due.is_needed(flow.target, cycle.number)
+        return not flow.sampled and self.routes.due.is_needed(flow.target, cycle.number)
 
     def unreached(self, cycle: LiveCycle, through: str) -> tuple[str, str] | None:
         """Return source and target of the first unconfirmed message between two nodes.
@@ -860,8 +666,8 @@ class Ledger:
         idle = {hop.task for hop in hops if hop.ended_ns == UNKNOWN and nodes[hop.task] == hop.node}
         missing = []
         of_shadow, number = through != cycle.placement, cycle.number
-        for one in self._forward:
-            if not (self.due.sends(one, number) if of_shadow else self._loses(one, cycle)):
+        for one in self.forward:
+            if not (self.routes.due.sends(one, number) if of_shadow else self.loses(one, cycle)):
                 continue
             if one.source in idle:
                 idle.add(one.target)
@@ -874,19 +680,10 @@ class Ledger:
         source, target = (f"{task}@{nodes[task]}" for task in (flow.source, flow.target))
         return source, target
 
-    def _diverging(self, cycle: LiveCycle) -> frozenset[str]:
-        """Tasks that a cycle does not share with its shadow."""
-        pair = cycle.placement, cycle.shadow
-        if pair not in self._apart:
-            here, there = (self._candidates[name] for name in pair)
-            self._apart[pair] = self._pipeline.diverging(here, there.first)
-        return self._apart[pair]
-
     def shadow_ends(self, cycle: LiveCycle) -> frozenset[str]:
         """Return the tasks that report the end of a cycle's shadow; none without a shadow."""
-        if cycle.shadow not in self._codes:
-            return frozenset()
-        return self.due.shadow_ends(self._diverging(cycle), cycle.number)
+        apart = self.routes.apart(cycle.placement, cycle.shadow)
+        return self.routes.due.shadow_ends(apart, cycle.number)
 
     def shadow_bytes(self, cycles: Iterable[LiveCycle]) -> tuple[int, int]:
         """Return the number of cycles with a shadow, and the bytes that shadows sent over links.
@@ -895,10 +692,11 @@ class Ledger:
         """
         sent = total = 0
         for cycle in cycles:
-            if cycle.shadow not in self._codes:
+            if cycle.shadow not in self._candidates:
                 continue
             sent += 1
-            apart, there = self._diverging(cycle), self._candidates[cycle.shadow].first
+            apart = self.routes.apart(cycle.placement, cycle.shadow)
+            there = self._candidates[cycle.shadow].first
             hops = [hop for report in cycle.shadows for hop in report.hops]
             ended = {hop.task for hop in hops if hop.ended_ns != UNKNOWN}
             total += sum(
@@ -917,14 +715,15 @@ def _between(before_ns: int, after_ns: int) -> int:
     return after_ns - before_ns if known else UNKNOWN
 
 
-def _by_site(hops: Iterable[Hop]) -> dict[Site, Hop]:
+def by_site(hops: Iterable[Hop]) -> dict[Site, Hop]:
     """Return jobs by task and node."""
     return {(hop.task, hop.node): hop for hop in hops}
 
 
-def _ended(done: Completion) -> Sequence[Hop]:
-    """Return the jobs of a report of `WITHOUT_JOB` that have ended."""
-    is_arrival = done.hops and done.hops[-1].ended_ns == UNKNOWN
+def jobs_in(done: Completion) -> Sequence[Hop]:
+    """Return the jobs of a report, without the arrival of a message that has begun no job."""
+    last = done.hops[-1] if done.hops else None
+    is_arrival = last is not None and last.ended_ns == UNKNOWN and done.outcome in WITHOUT_JOB
     return done.hops[:-1] if is_arrival else done.hops
 
 

@@ -32,6 +32,7 @@ from dwell.control import ClosedWindow, Controller, LookedAt
 from dwell.errors import LiveError
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
 from dwell.live.roles.data_ages import KnownOrigins
+from dwell.live.roles.live_evidence import LiveEvidence
 from dwell.live.roles.loads import ProcessLoads
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.roles.run_rows import LiveWindow, Resume, RunRows, sends_shadows
@@ -104,6 +105,7 @@ class LiveWindows:
         self.looked: LiveWindow | None = None
         self.heard = self.ignored = 0
         self._ledger = Ledger(problem, offsets)
+        self._evidence = LiveEvidence(problem, self._ledger)
         self._symptoms = Symptoms(problem, self._ledger)
         self._processes = ProcessLoads()
         self._stages = StageTable(problem)
@@ -289,7 +291,7 @@ class LiveWindows:
             self.origin_ns = stamp.released_ns
         if self._newest is not None:
             self._follow(*self._newest, stamp, at_ns)
-        cycle = LiveCycle.of(stamp, self.origin_ns, idle=self._ledger.due.is_idle(stamp.cycle))
+        cycle = self._ledger.cycle_of(stamp, self.origin_ns)
         line = self._line
         if line:
             for other in self._between(line[-1], cycle):
@@ -328,17 +330,14 @@ class LiveWindows:
             return
         if least <= span_ns <= most:
             for step in range(1, steps):
-                number = last.number + step
-                who = last.run, number, last.term, last.placement, ""
-                at_ns = last.at_ns + span_ns * step // steps
-                idle = self._ledger.due.is_idle(number)
-                yield LiveCycle(*who, at_ns, last.origin_ns, heard=False, idle=idle)
+                released_ns = last.origin_ns + last.at_ns + span_ns * step // steps
+                stamp = Stamp(last.run, last.number + step, last.term, last.placement, released_ns)
+                yield self._ledger.cycle_of(stamp, last.origin_ns, heard=False)
 
     def _insert(self, stamp: Stamp) -> LiveCycle | None:
         """Insert a cycle whose number seemed to have been skipped, if its release fits."""
         line = self._line
-        idle = self._ledger.due.is_idle(stamp.cycle)
-        cycle = LiveCycle.of(stamp, line[-1].origin_ns, idle=idle)
+        cycle = self._ledger.cycle_of(stamp, line[-1].origin_ns)
         place = bisect.bisect(line, cycle.key, key=lambda other: other.key)
         if not line[place - 1].at_ns <= cycle.at_ns <= line[place].at_ns:
             self.ignored += 1
@@ -492,7 +491,7 @@ class LiveWindows:
         row = self.record.next_row + end - 1 - self._window.at
         release_ns = np.array([cycle.at_ns for cycle in cycles], np.int64)
         shadows, earlier = sends_shadows(self._controller), self._earlier(cycles[0])
-        of_cycles = partial(self._ledger.evidence, cycles, release_ns, close_ns)
+        of_cycles = partial(self._evidence.known, cycles, release_ns, close_ns)
         known, ages = told(cycles), self.record.ages
         # Cycles of closed windows are judged by the end of their window.
         ages.judge(self._line[self._window.at : end], close_ns, ages.known)

@@ -46,15 +46,9 @@ class Routes:
         self._candidates = problem.candidates
         self._pipeline = problem.pipeline
         #: Tasks that run in each cycle.
-        self.due = due = DueTasks(problem.pipeline)
+        self.due = DueTasks(problem.pipeline)
         self._outputs = {name: problem.pipeline.outputs(name) for name in problem.pipeline.tasks}
-        self._outputs[STAMPER] = tuple(Flow(STAMPER, name) for name in due.sources)
-        # Rates of messages, as far as some cycles have none.
-        rates = {
-            name: {due.rates[flow.source if flow.sampled else flow.target] for flow in flows}
-            for name, flows in self._outputs.items()
-        }
-        self._rates = {name: tuple(of - {1}) for name, of in rates.items()}
+        self._outputs[STAMPER] = tuple(Flow(STAMPER, name) for name in self.due.sources)
         self._apart: dict[tuple[str, str], frozenset[str]] = {}
         self._known: dict[tuple[object, ...], tuple[Destination, ...]] = {}
 
@@ -69,15 +63,19 @@ class Routes:
         is_second = isinstance(placed, Replicas) and placed.first[task] != node
         return _after_ns(placed) if is_second else 0
 
+    def apart(self, placement: str, shadow: str) -> frozenset[str]:
+        """Return the tasks that a cycle does not share with its shadow; none without a shadow."""
+        pair = placement, shadow
+        if pair not in self._apart:
+            active, other = (self._candidates.get(name) for name in pair)
+            if active is None or other is None:
+                return frozenset()
+            self._apart[pair] = self._pipeline.diverging(active, other.first)
+        return self._apart[pair]
+
     def shadow_ends(self, stamp: Stamp) -> frozenset[str]:
         """Return the tasks that report the end of a cycle's shadow; none without a shadow."""
-        active, other = (self._candidates.get(name) for name in (stamp.placement, stamp.shadow))
-        if active is None or other is None:
-            return frozenset()
-        pair = stamp.placement, stamp.shadow
-        if pair not in self._apart:
-            self._apart[pair] = self._pipeline.diverging(active, other.first)
-        return self.due.shadow_ends(self._apart[pair], stamp.cycle)
+        return self.due.shadow_ends(self.apart(stamp.placement, stamp.shadow), stamp.cycle)
 
     def destinations(
         self, task: str, stamp: Stamp, node: str = "", *, shadow: bool = False
@@ -88,9 +86,8 @@ class Routes:
         nodes. `shadow` is set for the output of a shadow. Raises a LiveError if the stamp's
         placement or shadow is not a candidate.
         """
-        sends = tuple(stamp.cycle % rate == 0 for rate in self._rates[task])
         of_stamp = stamp.placement, stamp.shadow, stamp.forks, stamp.term == 0
-        key = (task, node, *of_stamp, shadow, sends)
+        key = (task, node, *of_stamp, shadow, self.due.pattern(stamp.cycle))
         known = self._known.get(key)
         if known is None:
             self._check(stamp)
@@ -117,7 +114,7 @@ class Routes:
             return
         placement = self._candidates[stamp.placement]
         other = self._candidates[stamp.shadow].first if stamp.shadow else None
-        apart = self._pipeline.diverging(placement, other) if other is not None else frozenset()
+        apart = self.apart(stamp.placement, stamp.shadow)
         # The cycle's tasks also send to the shadow, except for tasks that run twice.
         shares = shadow or task not in apart
         copies = () if shadow else _copies_at(placement, task, node)
