@@ -16,7 +16,7 @@ from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
 from dwell.dash.observer import OUTCOMES, Observer
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 from dwell.live.roles.controlled_cell import MOVED_BY
 from dwell.live.roles.health import Health
 from dwell.live.wire.keys import CONTROLLER
@@ -122,7 +122,7 @@ class CellMetrics(Collector):
 
     def __enter__(self) -> CellMetrics:
         """Start the thread that counts cycles."""
-        start_thread("metrics", self._keep_up)
+        start_repeating("metrics", EVERY_S, self._stopped, self._count)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -211,10 +211,6 @@ class CellMetrics(Collector):
         keyring = self._observer.security.keyring
         for subject in () if keyring is None else keyring.roster.subjects.values():
             yield {"subject": subject.name}, subject.ends.timestamp()
-
-    def _keep_up(self) -> None:
-        while not self._stopped.wait(EVERY_S):
-            self._count()
 
     def _count(self) -> None:
         """Count the new cycles of the feed."""

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from dwell.dash.feed import Feed
 from dwell.errors import LiveError
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 from dwell.live.host.operator_client import OperatorClient
 from dwell.live.log import printable
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle
@@ -226,7 +226,10 @@ class Observer:
         """Request the status once, then subscribe and start the thread of requests."""
         self._look()
         self.hear_through(self._place.transport)
-        self._asks = start_thread("asks", self._ask_on)
+        # Twice per decision, within `LEAST_ASK_S` and `MOST_ASK_S`.
+        apart_ms = self.problem.decide_cycles * self.problem.pipeline.period_ms
+        every_s = min(max(apart_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
+        self._asks = start_repeating("asks", every_s, self._stopped, self._ask)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -394,13 +397,10 @@ class Observer:
 
     # ------------------------------------------------------------------------ status
 
-    def _ask_on(self) -> None:
-        """Request the status twice per decision, within `LEAST_ASK_S` and `MOST_ASK_S`."""
-        apart_ms = self.problem.decide_cycles * self.problem.pipeline.period_ms
-        every_s = min(max(apart_ms / 2e3, LEAST_ASK_S), MOST_ASK_S)
-        while not self._stopped.wait(every_s):
-            self._renew()
-            self._look()
+    def _ask(self) -> None:
+        """Use newer keys, if any, and request the status."""
+        self._renew()
+        self._look()
 
     def _look(self) -> None:
         status = self._client.look(patience_s=MOST_ASK_S)

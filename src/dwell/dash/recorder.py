@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from dwell.dash.feed import Feed
 from dwell.dash.observer import ObservedCycle, ObservedWindow, Observer
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 from dwell.model.table_columns import LIVE
 from dwell.record import column_types
 from dwell.record.mcap_file import TIME_OF_DAY, McapFile, Message
@@ -76,7 +76,7 @@ class CellRecorder:
 
     def __enter__(self) -> CellRecorder:
         """Start the thread that reads the feeds."""
-        self._thread = start_thread("recorder", self._go_on)
+        self._thread = start_repeating("recorder", EVERY_S, self._stopped, self._look)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -92,10 +92,6 @@ class CellRecorder:
             f"{self._path}: {self.recorded} cycles and windows recorded + {self.dropped} dropped = "
             f"{self.published} published"
         )
-
-    def _go_on(self) -> None:
-        while not self._stopped.wait(EVERY_S):
-            self._look()
 
     def _look(self, *, last: bool = False) -> None:
         """Write new cycles and windows, once the first stamp has set the origin of time."""

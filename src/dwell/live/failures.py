@@ -39,6 +39,18 @@ def end_process(what: str, error: BaseException) -> NoReturn:
     os._exit(FAILED)
 
 
+def start_repeating(
+    name: str, every_s: float, stopped: threading.Event, act: Callable[[], object]
+) -> threading.Thread:
+    """Start a thread that calls a function once per `every_s`, until `stopped` is set."""
+
+    def repeat() -> None:
+        while not stopped.wait(every_s):
+            act()
+
+    return start_thread(name, repeat)
+
+
 def start_thread(name: str, run: Callable[..., object], *arguments: object) -> threading.Thread:
     """Start a daemon thread that ends the process if it fails."""
 

@@ -27,7 +27,7 @@ import msgspec
 from dwell.cellfile import load, load_without_traces
 from dwell.errors import DwellError, LiveError
 from dwell.files import write_whole
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 from dwell.live.host.state_files import boot_id, make_folder
 from dwell.model import FrozenDict, Problem
 from dwell.model.document import digests
@@ -210,11 +210,7 @@ class CellKeeper:
     def begin(self, stopped: threading.Event) -> None:
         """Write the copy, and compare it with the files in a thread until `stopped` is set."""
         self.look()
-        start_thread("cell file", self._look_again, stopped)
-
-    def _look_again(self, stopped: threading.Event) -> None:
-        while not stopped.wait(COMPARE_S):
-            self.look()
+        start_repeating("cell file", COMPARE_S, stopped, self.look)
 
     def take_over(self, check: Callable[[KeptCell], object] = str) -> Change | None:
         """Replace the copy by the present files, and return the change.

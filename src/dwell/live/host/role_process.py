@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from dwell.errors import LiveError
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 from dwell.live.host.hosting import (
     LONGEST_SLEEP_S,
     PLAIN,
@@ -102,7 +102,7 @@ def _run(
     sink = Sink(place, role.task, actuator, highest)
     if group is not None:
         sink.group_clock = group.taken_ns
-    start_thread("actuator", _watch, sink, clock, stopped)
+    start_repeating("actuator", LONGEST_SLEEP_S, stopped, lambda: sink.watch(clock()))
     hosted = _host(sink, place, stopped, clock)
     # Wait for a command that is being applied; the role accepts no further commands.
     with hosted.lock:
@@ -115,11 +115,6 @@ def _host(role: RoleLogic, place: RolePlace, stopped: threading.Event, clock: Cl
     keep_collections_short()
     hosted.run()
     return hosted
-
-
-def _watch(sink: Sink, clock: Clock, stopped: threading.Event) -> None:
-    while not stopped.wait(LONGEST_SLEEP_S):
-        sink.watch(clock())
 
 
 def bring_to_rest(sink: Sink, patience_s: float = ENDING_S) -> bool:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from dwell.errors import Fault, LiveError, TrustError, installing
 from dwell.files import write_whole
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 from dwell.live.transport.zenoh import ZenohSettings, ZenohTransport
 from dwell.live.trust import KEYS
 from dwell.live.wire.transport import Transport
@@ -141,12 +141,8 @@ class Security:
             for line in self.warnings():
                 say(line)
 
-        def repeat() -> None:
-            while not stopped.wait(REMIND_S):
-                tell()
-
         tell()
-        start_thread("keys", repeat)
+        start_repeating("keys", REMIND_S, stopped, tell)
 
     @property
     def _protocol(self) -> str:
