@@ -229,7 +229,7 @@ def test_an_order_that_was_asked_for_anew_before_its_answer_came_is_no_move_of_t
     world.run(12_000)
     assert len(world.stamper.moves) >= 12
     assert {why for _, _, why in world.stamper.moves} == {"order"}
-    assert cell.guard_moves == 0
+    assert cell.moves["guard"] == 0
     assert not cell.course.by_guard
     assert "guard" not in {why for (why,) in columns(world, "decisions", "reason")}
 
@@ -288,7 +288,7 @@ def test_an_order_that_comes_after_the_guards_move_has_not_brought_it_about(
     cell = world.cell
     assert (cell.course.term, cell.course.placement) == (world.stamper.term, "LOC")
     assert cell.course.by_guard
-    assert cell.guard_moves == 1
+    assert cell.moves["guard"] == 1
 
 
 def test_what_nobody_wants_any_more_is_probed_no_longer(problem: Problem) -> None:
@@ -473,7 +473,7 @@ def test_moves_of_the_guard_are_told_to_the_policy_and_recorded(problem: Problem
     assert cell.course.placement == "LOC"
     rows = columns(world, "decisions", "incumbent", "placement", "migrated", "reason")
     assert ("SO", "LOC", True, "guard") in rows
-    assert cell.guard_moves == 1
+    assert cell.moves["guard"] == 1
 
 
 def test_it_says_how_long_the_guard_rests_after_its_own_move(problem: Problem) -> None:

@@ -153,7 +153,7 @@ def test_one_false_stamp_or_completion_ends_no_decisions(world: World, what: str
         world.run(700)
         completed(world, outcome, **FALSE[what](world))
     goes_on(world)
-    assert world.cell.guard_moves == 0
+    assert world.cell.moves["guard"] == 0
 
 
 @pytest.mark.parametrize(

@@ -9,20 +9,17 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any, Literal, Protocol, TypeAlias
-
-from msgspec.structs import asdict
 
 from dwell.control import Controller, Proposal
 from dwell.errors import LiveError
 from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.roles.live_windows import LiveWindows
+from dwell.live.roles.members_status import members_status
 from dwell.live.roles.role import CONTROLLER_BEAT, REPEATED_NS, Pulse, RolePlace
 from dwell.live.roles.run_rows import Resume, Rows
 from dwell.live.wire import channels
 from dwell.live.wire.continuity import Continuity, SetbackDetector
-from dwell.live.wire.keys import CONTROLLER
 from dwell.live.wire.messages import (
     OTHER,
     Accepted,
@@ -35,7 +32,6 @@ from dwell.live.wire.messages import (
     Stamped,
 )
 from dwell.live.wire.transport import Arrival
-from dwell.live.wire.wiring import roles
 from dwell.model import REASONS, Reason
 from dwell.model.placement import nodes_of
 
@@ -144,16 +140,6 @@ class ControlledCell:
         self._window_ns = 0
         # Whether there are rows to record.
         self._unwritten = False
-
-    @property
-    def guard_moves(self) -> int:
-        """Number of moves by the guard."""
-        return self.moves["guard"]
-
-    @property
-    def migrations(self) -> int:
-        """Number of moves by order."""
-        return self.moves.total() - self.guard_moves
 
     # ---------------------------------------------------------------------- receiving
 
@@ -398,17 +384,17 @@ class ControlledCell:
         continuity, windows = self.continuity, self.windows
         newest, upcoming = continuity.newest, (answer.run, answer.cycle)
         ahead = continuity.ahead(now_ns)
-        if newest is None or newest[0] < answer.run or answer.cycle > newest[1] + ahead:
-            continuity.believe((answer.run, answer.cycle - 1), now_ns)
-            self._cycle_asked = self.order_number
-        elif upcoming <= newest and answer.number > self._cycle_asked:
+        leaps = newest is None or newest[0] < answer.run or answer.cycle > newest[1] + ahead
+        if newest is not None and not leaps:
+            if upcoming > newest or answer.number <= self._cycle_asked:
+                return True
             self.place.complain(
                 LiveError(f"the stamper has not stamped cycle {newest[1]}; {answer.cycle} is next")
             )
-            continuity.believe((answer.run, answer.cycle - 1), now_ns)
-            self._cycle_asked = self.order_number
             if windows is not None:
                 windows.forget(answer.run, answer.cycle)
+        continuity.believe((answer.run, answer.cycle - 1), now_ns)
+        self._cycle_asked = self.order_number
         return True
 
     def _take_back(self, answer: Accepted) -> None:
@@ -746,8 +732,8 @@ class ControlledCell:
             "proving": self._proving(now_ns),
             "moving_to": move.name if move is not None and not move.refused else None,
             "refused": self.refused or None,
-            "migrations": self.migrations,
-            "guard_moves": self.guard_moves,
+            "migrations": self.moves.total() - self.moves["guard"],
+            "guard_moves": self.moves["guard"],
             "moves": dict(self.moves),
             "disbelieved": self.continuity.leaps,
             "window": {**self._window, "age_ms": age_ms} if self._window else {},
@@ -755,10 +741,7 @@ class ControlledCell:
             "flows": {},
             **(self.windows.status() if self.windows is not None else {}),
             **(self.windows.symptoms(now_ns) if self.windows is not None else {}),
-            "topics": self._topics(now_ns),
-            "processes": self._processes(now_ns),
-            "certificates": self._certificates(now_ns),
-            **self._missing(now_ns),
+            **members_status(self.pulse, now_ns),
             "complaints": dict(list(self.place.complaints.items())[-10:]),
             "record": self._recorder.trouble or None,
             "changed": self._changed() or None,
@@ -774,62 +757,3 @@ class ControlledCell:
         needed = (told and told.needed) or self.place.problem.controller.probe_cycles
         done = told.probes if told is not None and told.probed == desired else 0
         return {"candidate": desired, "done": done, "needed": needed}
-
-    def _processes(self, now_ns: int) -> dict[str, dict[str, Any]]:
-        """Return age and state of the last beat, by process."""
-        silent_ns = silent_after_ns(self.place.problem)
-        return {
-            who: {
-                "age_ms": round(age_ns / 1e6, 1),
-                "heard": age_ns <= silent_ns,
-                "ready": beat.ready and age_ns <= silent_ns,
-                "note": beat.note,
-            }
-            for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
-        }
-
-    def _topics(self, now_ns: int) -> dict[str, dict[str, Any]]:
-        """Return the rates of the topics that sources read, by source."""
-        silent_ns, period_ms = silent_after_ns(self.place.problem), self.place.period_ns / 1e6
-        return {
-            who: {**asdict(beat.rates), "period_ms": period_ms}
-            for who, beat, age_ns in self.pulse.detector.everybody(now_ns)
-            if beat.rates is not None and age_ns <= silent_ns
-        }
-
-    def _certificates(self, now_ns: int) -> dict[str, dict[str, Any]]:
-        """Return the ends of the certificates in use, by node and for this controller."""
-        if self.place.seals is None:
-            return {}
-        keyring, silent_ns = self.place.seals.keyring, silent_after_ns(self.place.problem)
-        # Oldest certificate that a process of the node uses; silent processes count only if all
-        # are silent.
-        used = {CONTROLLER: (False, keyring.own.generation)}
-        for _, beat, age_ns in self.pulse.detector.everybody(now_ns):
-            found = age_ns > silent_ns, beat.generation
-            used[beat.node] = min(used.get(beat.node, found), found)
-        now, certificates = datetime.now(UTC), {}
-        for name in (*self.place.problem.fabric.nodes, CONTROLLER):
-            known = {one.generation: one for one in reversed(keyring.roster.of(name))}
-            newest = max(known, default=0)
-            if one := known.get(used.get(name, (True, newest))[1], known.get(newest)):
-                certificates[name] = {
-                    "expires": one.expires,
-                    "days": round((one.ends - now).total_seconds() / 86_400, 6),
-                    "soon": now >= one.warns_from,
-                }
-        return certificates
-
-    def _missing(self, now_ns: int) -> dict[str, Any]:
-        """Return rejected processes with the reason, and processes that have never sent a beat."""
-        strangers = self.pulse.strangers
-        differ = {
-            who: why for who, (why, at_ns) in strangers.items() if now_ns - at_ns < REPEATED_NS
-        }
-        heard = {who for who, _, _ in self.pulse.detector.everybody(now_ns)}
-        silent = [
-            role.who
-            for role in roles(self.place.problem)
-            if role.who not in heard | differ.keys() and role.who != self.place.who
-        ]
-        return {"strangers": differ, "silent": silent}
