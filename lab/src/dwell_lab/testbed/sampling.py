@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Collection, Mapping, Sequence
-from pathlib import Path
 from typing import Any
+
+import psutil
 
 from dwell.errors import LiveError
 from dwell.live.local.child import Started
@@ -19,9 +19,6 @@ from dwell_lab.testbed.pressure import Rule, Sample
 from dwell_lab.testbed.probe import Probe
 
 EVERY_S = 0.1
-STAT = Path("/proc/stat")
-# Fields of a CPU's line in /proc/stat.
-IDLE, IOWAIT, STEAL = 3, 4, 7
 #: Counts of a link that are summed up over all samples.
 TOTALS = ("bursts", "delay_ns", "squares", "held", "vanished")
 
@@ -158,13 +155,7 @@ def rate_hz(before: Mapping[int, int], after: Mapping[int, int], lasted_s: float
 
 def cpu_times(cpus: Collection[int]) -> tuple[dict[int, float], dict[int, float]]:
     """Return the idle and the stolen seconds of CPUs since the machine's start."""
-    tick_s = 1.0 / os.sysconf("SC_CLK_TCK")
-    wanted = {f"cpu{cpu}": cpu for cpu in cpus}
-    idle_s, stolen_s = {}, {}
-    for line in STAT.read_text().splitlines():
-        name, _, rest = line.partition(" ")
-        if name in wanted:
-            ticks = [int(field) for field in rest.split()]
-            idle_s[wanted[name]] = (ticks[IDLE] + ticks[IOWAIT]) * tick_s
-            stolen_s[wanted[name]] = ticks[STEAL] * tick_s if len(ticks) > STEAL else 0.0
-    return idle_s, stolen_s
+    times = enumerate(psutil.cpu_times(percpu=True))
+    known = {cpu: spent for cpu, spent in times if cpu in cpus}
+    idle_s = {cpu: spent.idle + spent.iowait for cpu, spent in known.items()}
+    return idle_s, {cpu: spent.steal for cpu, spent in known.items()}
