@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import os
 import shutil
@@ -13,9 +12,10 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import psutil
 
 from dwell.errors import LiveError
@@ -440,7 +440,7 @@ def write_mark(mark: Path, group: ProcessGroup | None) -> None:
     """Write the group of a running process for the next agent."""
     if group is not None:
         # No sync to the disk: after a power failure, the process has ended anyway.
-        write_whole(mark, json.dumps(asdict(group)), durable=False)
+        write_whole(mark, msgspec.json.encode(group), durable=False)
 
 
 def claim(folder: Path, who: str) -> None:
@@ -460,10 +460,8 @@ def claim(folder: Path, who: str) -> None:
 def marked_group(mark: Path) -> ProcessGroup | None:
     """Return the group in a ``pid`` file, whether its process runs or not."""
     try:
-        content = json.loads(mark.read_text())
-        pid, started = int(content["pid"]), float(content["started"])
-        return ProcessGroup(pid, started, int(content.get("session", -1)))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return msgspec.json.decode(mark.read_bytes(), type=ProcessGroup)
+    except (OSError, msgspec.MsgspecError):
         return None
 
 
