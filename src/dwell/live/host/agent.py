@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 
 import msgspec
 import psutil
@@ -26,7 +26,6 @@ from dwell.live.wire.continuity import SetbackDetector
 from dwell.live.wire.keys import Channel
 from dwell.live.wire.messages import (
     MAX_HEADER_BYTES,
-    Beat,
     Beats,
     Carried,
     Load,
@@ -235,7 +234,9 @@ class Agent:
         key = place.keys.of(channels.BEATS, place.node)
         payload = place.sealed(channels.BEATS, Beats(tuple(beats)))
         if len(payload) > MAX_HEADER_BYTES:
-            payload = place.sealed(channels.BEATS, Beats(tuple(_shortened(beats))))
+            # Only the notes can be that long.
+            beats = [msgspec.structs.replace(beat, note=beat.note[:SHORT_NOTE]) for beat in beats]
+            payload = place.sealed(channels.BEATS, Beats(tuple(beats)))
         place.transport.put(key, payload)
         if self._relays:
             self._beats.add(key.removeprefix(f"{place.keys.root}/"), payload)
@@ -286,9 +287,3 @@ class Agent:
         load = Load(place.node, place.life, now_ns, *spent, used, each, self._stages)
         self._stages = ()
         place.send(channels.LOAD, load, place.node)
-
-
-def _shortened(beats: Iterable[Beat]) -> Iterator[Beat]:
-    """Yield beats with short notes."""
-    for beat in beats:
-        yield msgspec.structs.replace(beat, note=beat.note[:SHORT_NOTE])

@@ -102,7 +102,7 @@ class Stamper:
         #: Run, term and placement of the cell.
         self.course = self.guard.course
         self.course.enter(entry.run, entry.term)
-        self.pulse = Pulse(place, self._ready, self._holds, hears=[("*", "*")], nodes=["*"])
+        self.pulse = Pulse(place, lambda: (True, ""), self._holds, hears=[("*", "*")], nodes=["*"])
         self._agents = [f"agent@{node}" for node in problem.fabric.nodes]
         self._asked_ns = -NEVER_NS
         self.timer = problem.live.release == "timer"
@@ -510,9 +510,6 @@ class Stamper:
         return self._names[int(plan[0])] if plan[0] >= 0 else ""
 
     # --------------------------------------------------------------------------- beats
-
-    def _ready(self) -> tuple[bool, str]:
-        return True, ""
 
     def _holds(self) -> BeatState:
         return BeatState(self.course.term, self.course.placement)

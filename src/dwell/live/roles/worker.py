@@ -71,12 +71,10 @@ class Worker:
         problem = place.problem
         self.routes = Routes(problem)
         self.offsets = place.offsets()
-        #: Declared bytes of inputs (by source), outputs (by target) and state; they determine the
-        #: lanes and the longest payloads.
+        #: Declared bytes of inputs (by source) and outputs (by target), which determine the lanes
+        #: and the longest payloads.
         self._input_bytes = {f.source: f.payload_bytes for f in problem.pipeline.inputs(task)}
         self._output_bytes = {f.target: f.payload_bytes for f in problem.pipeline.outputs(task)}
-        self._state_bytes = problem.pipeline.tasks[task].state_bytes
-        self._nodes = frozenset(problem.pipeline.tasks[task].on)
         #: Inputs that the task does not wait for.
         forwards = not (shadow or stands_by)
         self.samples = SampledInputs(place, task, forwards=forwards)
