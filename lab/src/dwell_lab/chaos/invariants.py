@@ -97,7 +97,7 @@ class Judge:
         try:
             match CHANNELS.get(word):
                 case channels.STAMPED:
-                    return self._stamped(at_ns, decode(payload, Stamped))
+                    return list(self._stamped(at_ns, decode(payload, Stamped)))
                 case channels.ORDER:
                     return self._ordered(decode(payload, Order))
                 case channels.ACCEPTED:
@@ -127,19 +127,18 @@ class Judge:
         self._moved.clear()
         self._looked, self._last = -1, (-1, -1, -1)
 
-    def _stamped(self, at_ns: int, stamp: Stamp) -> list[str]:
-        violations = []
+    def _stamped(self, at_ns: int, stamp: Stamp) -> Iterable[str]:
         if self.renews and -1 < self.run < stamp.run:
             self._begin_run()
         run, cycle, term = self._last
         if run not in (-1, stamp.run):
-            violations.append(f"cycle {stamp.cycle} is of run {stamp.run}, after {run}")
+            yield f"cycle {stamp.cycle} is of run {stamp.run}, after {run}"
         elif stamp.cycle <= cycle:
-            violations.append(f"cycle {stamp.cycle} is stamped after {cycle}")
+            yield f"cycle {stamp.cycle} is stamped after {cycle}"
         elif stamp.term < term:
-            violations.append(f"cycle {stamp.cycle} has term {stamp.term}, after term {term}")
+            yield f"cycle {stamp.cycle} has term {stamp.term}, after term {term}"
         if stamp.placement not in self.problem.candidates:
-            violations.append(f"cycle {stamp.cycle} is stamped {stamp.placement!r}, no candidate")
+            yield f"cycle {stamp.cycle} is stamped {stamp.placement!r}, no candidate"
         self._last = stamp.run, stamp.cycle, stamp.term
         self._stamps.append(self._last)
         del self._stamps[:-MEMORY]
@@ -148,10 +147,7 @@ class Judge:
         if known is None:
             self.terms[stamp.term] = Term(stamp.term, stamp.placement, stamp.cycle, at_ns)
         elif known.placement != stamp.placement:
-            violations.append(
-                f"term {stamp.term} has two placements: {known.placement}, {stamp.placement}"
-            )
-        return violations
+            yield f"term {stamp.term} has two placements: {known.placement}, {stamp.placement}"
 
     # ------------------------------------------------------------------------- orders
 
@@ -160,7 +156,7 @@ class Judge:
         _remember(self._orders, who, order)
         # Orders and answers use different connections: an answer may arrive before its order.
         answer = self._early.pop(who, None)
-        return [] if answer is None else self._weigh(order, answer)
+        return [] if answer is None else list(self._weigh(order, answer))
 
     def _accepted(self, answer: Accepted) -> list[str]:
         self.held[answer.term] = not answer.fallback
@@ -170,29 +166,26 @@ class Judge:
         if who not in self._orders:
             _remember(self._early, who, answer)
             return []
-        return self._weigh(self._orders[who], answer)
+        return list(self._weigh(self._orders[who], answer))
 
-    def _weigh(self, order: Order, answer: Accepted) -> list[str]:
+    def _weigh(self, order: Order, answer: Accepted) -> Iterable[str]:
         """Compare an answer with its order, and with the stamps before it."""
         if (order.run, order.term) == (0, 0):
-            return []
-        violations = []
+            return
         what = f"order {order.number} of term {order.term}"
         if order.run != answer.run:
-            violations.append(f"{what} and run {order.run} is accepted in run {answer.run}")
+            yield f"{what} and run {order.run} is accepted in run {answer.run}"
         if answer.term not in (order.term, order.term + 1):
-            violations.append(f"{what} is accepted in term {answer.term}")
+            yield f"{what} is accepted in term {answer.term}"
         later = [one for one in self._stamps if one[1] < answer.cycle and one[2] > order.term]
         if later:
-            violations.append(f"{what} is accepted after cycle {later[0][1]} of term {later[0][2]}")
-        if order.placement:
-            if order.placement != answer.placement:
-                violations.append(f"{what} asks for {order.placement} and gets {answer.placement}")
-            if order.placement not in self.problem.candidates:
-                violations.append(f"{what} to {order.placement!r}, no candidate, is accepted")
+            yield f"{what} is accepted after cycle {later[0][1]} of term {later[0][2]}"
+        if order.placement not in ("", answer.placement):
+            yield f"{what} asks for {order.placement} and gets {answer.placement}"
+        if order.placement and order.placement not in self.problem.candidates:
+            yield f"{what} to {order.placement!r}, no candidate, is accepted"
         if answer.term == order.term + 1:
             self._moved.add(answer.term)
-        return violations
 
     def migrations(self) -> list[str]:
         """Return the controller's migrations since the last call that were too early.
