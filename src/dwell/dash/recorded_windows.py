@@ -16,13 +16,13 @@ from dwell.model.number_arrays import Floats
 from dwell.record import Names, Run, shown_reason
 from dwell.record.moves import GUARD, by_guard
 
-#: Columns of the measured values by the names of their estimates.
+#: Columns of measured values, and of estimates without the candidate's name.
 SEEN = {
-    "l95_ms": "seen_l95_ms",
-    "violation_rate": "seen_violation_rate",
-    "cost": "cost",
-    "age_ms": "seen_age_ms",
-    "price_per_hour": "seen_price_per_hour",
+    "cost": ("cost", "j"),
+    "l95_ms": ("seen_l95_ms", "est_l95_ms"),
+    "violation_rate": ("seen_violation_rate", "est_violation_rate"),
+    "age_ms": ("seen_age_ms", "est_age_ms"),
+    "price_per_hour": ("seen_price_per_hour", "est_price_per_hour"),
 }
 #: Explanation of the reason of a move to the least bad of all candidates.
 INFEASIBLE = "all candidates are over a cap, this one least"
@@ -77,7 +77,7 @@ class RecordedWindows:
         self.counts = ~windows["warmup"].astype(bool)
         self.placement = placement_codes(windows.names("placement"), self._candidates)
         self.seen = {
-            name: windows[of].astype(np.float64) for name, of in SEEN.items() if of in windows
+            name: windows[of].astype(np.float64) for name, (of, _) in SEEN.items() if of in windows
         }
         self.used = {
             name: windows[f"u_{name}"].astype(np.float64) for name in problem.fabric.resources
@@ -192,13 +192,7 @@ class RecordedWindows:
 
     def _estimate(self, row: int, name: str) -> Plain:
         """Return the estimates of a candidate at a decision; `eligible` means within all caps."""
-        estimates = {
-            "cost": f"j_{name}",
-            "l95_ms": f"est_l95_ms_{name}",
-            "violation_rate": f"est_violation_rate_{name}",
-            "age_ms": f"est_age_ms_{name}",
-            "price_per_hour": f"est_price_per_hour_{name}",
-        }
+        estimates = {key: f"{of}_{name}" for key, (_, of) in SEEN.items()}
         known = {key: column for key, column in estimates.items() if column in self.decisions}
         values = self._numbers(row, *known.values())
         within = bool(self.decisions[f"eligible_{name}"][row])

@@ -13,6 +13,7 @@ from dwell.calibration.machine_conditions import STOLEN_MOST, MachineCounters, p
 from dwell.cli.findings import Finding, Part, optional
 from dwell.errors import LiveError, TrustError, installing
 from dwell.live.local.cgroups import find_cgroups
+from dwell.live.roles.control_group import groups_of
 from dwell.live.wire.local_addresses import is_here, taken_ports
 from dwell.model import Host, Problem
 
@@ -58,17 +59,14 @@ def _quota() -> float | None:
     """Return the smallest quota of this process's control group and its parents, in CPUs."""
     try:
         groups = find_cgroups()
-        lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
-    except (LiveError, OSError):
+        paths = groups_of(Path("/proc/self/cgroup").read_text(encoding="utf-8"))
+        path = paths["cpu" if groups.version == 1 else ""]
+    except (LiveError, OSError, KeyError):
         return None
     top = groups.folders["cpu"]
-    quotas = []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        if controllers.split(",").count("cpu" if groups.version == 1 else ""):
-            folder = top / path.lstrip("/")
-            around = (group for group in (folder, *folder.parents) if group.is_relative_to(top))
-            quotas += [_limit(group) for group in around]
+    folder = top / path.lstrip("/")
+    around = (group for group in (folder, *folder.parents) if group.is_relative_to(top))
+    quotas = map(_limit, around)
     return min((quota for quota in quotas if quota is not None), default=None)
 
 

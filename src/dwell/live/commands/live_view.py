@@ -82,7 +82,7 @@ class Lines:
 
 
 def _error(state: CellState) -> str:
-    return "" if math.isnan(state.error_mm) else f"  error {_number(state.error_mm, 'mm')}"
+    return "" if math.isnan(state.error_mm) else f"  error {state.error_mm:.1f} mm"
 
 
 def _float(value: object) -> float:
@@ -92,8 +92,3 @@ def _float(value: object) -> float:
 def _metric(window: Mapping[str, Any], column: str) -> str:
     metric, value = METRICS[column], _float(window.get(column))
     return f"  {metric.name} {'-' if math.isnan(value) else metric.text(value)}"
-
-
-def _number(value: object, unit: str) -> str:
-    known = _float(value)
-    return "-" if math.isnan(known) else f"{known:.1f} {unit}"

@@ -102,7 +102,7 @@ class ControlGroup:
 def own_group(process: Path = PROCESS) -> ControlGroup | None:
     """Return this process's control group; None for the root group or if counters are missing."""
     try:
-        groups = _groups((process / "cgroup").read_text())
+        groups = groups_of((process / "cgroup").read_text())
         mounts = list(cgroup_mounts((process / "mountinfo").read_text()))
     except OSError:
         return None
@@ -121,7 +121,7 @@ def _below(group: str, root: str) -> bool:
     return group == root or group.startswith(root.rstrip("/") + "/")
 
 
-def _groups(text: str) -> dict[str, str]:
+def groups_of(text: str) -> dict[str, str]:
     """Return the group in each hierarchy, by controller; version 2 has the empty name."""
     found = {}
     for line in text.splitlines():

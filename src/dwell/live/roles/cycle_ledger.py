@@ -287,7 +287,7 @@ class Ledger:
         order = pipeline.topological()
         #: Flows in the order of their sources in the pipeline.
         self.forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
-        self._accelerated: dict[str, frozenset[str]] = {}
+        self._accelerated = {name: self._accelerators(name) for name in self._candidates}
 
     def cycle_of(self, stamp: Stamp, origin_ns: int, *, heard: bool = True) -> LiveCycle:
         """Return the cycle of a stamp; without `heard`, of a stamp that its neighbours imply."""
@@ -526,7 +526,7 @@ class Ledger:
         """
         own, shadow, placed = Counter[str](), Counter[str](), set[str]()
         for cycle in cycles:
-            placed |= self._accelerators_of(cycle.placement)
+            placed |= self._accelerated[cycle.placement]
             for (is_shadow, *_), hop in self._jobs(cycle).items():
                 execution = self._execution(hop)
                 if execution is None or execution.accelerator is None or hop.ended_ns == UNKNOWN:
@@ -541,15 +541,12 @@ class Ledger:
             for name in {*own, *shadow, *placed}
         }
 
-    def _accelerators_of(self, candidate: str) -> frozenset[str]:
-        """Resource names of the accelerators that a candidate's tasks run on."""
-        known = self._accelerated.get(candidate)
-        if known is None:
-            placed = self._candidates[candidate].sites
-            executions = ((self._pipeline.tasks[task].on[node], node) for task, node in placed)
-            names = (one.resource(node) for one, node in executions if one.accelerator is not None)
-            known = self._accelerated[candidate] = frozenset(names)
-        return known
+    def _accelerators(self, candidate: str) -> frozenset[str]:
+        """Return the resource names of the accelerators that a candidate's tasks run on."""
+        placed = self._candidates[candidate].sites
+        executions = ((self._pipeline.tasks[task].on[node], node) for task, node in placed)
+        used = (one.resource(node) for one, node in executions if one.accelerator is not None)
+        return frozenset(used)
 
     def _execution(self, hop: Hop) -> Execution | None:
         """Return the execution of a job's task on its node, or None."""

@@ -29,6 +29,8 @@ Key: TypeAlias = tuple[int, int]
 ABSENT, WAITING, TAKEN, REPLACED, DROPPED = range(5)
 #: Names of the final states in the status.
 ENDS = "taken", "replaced", "dropped"
+#: Counts of a stage in the status.
+COUNTS = "jobs", "replaced", "dropped"
 #: Time between two reports of an agent.
 REPORT_NS = 1_000_000_000
 #: Number of blocks kept by a worker (rows) and by a controller (sums).
@@ -296,9 +298,7 @@ def _stage(sums: Sequence[StageCounts]) -> dict[str, Any]:
     return {
         "exec_median_ms": most.median_ns / 1e6 if most.jobs else None,
         "exec_p95_ms": most.p95_ns / 1e6 if most.jobs else None,
-        "jobs": sum(one.jobs for one in sums),
-        "replaced": sum(one.replaced for one in sums),
-        "dropped": sum(one.dropped for one in sums),
+        **{name: sum(getattr(one, name) for one in sums) for name in COUNTS},
         "inputs_total": dict(zip(ENDS, totals, strict=True)),
     }
 
@@ -307,11 +307,7 @@ def _flow(
     outputs: Sequence[OutputCounts], inputs: Sequence[InputCounts], *, settled: bool
 ) -> dict[str, int]:
     """Return the states of a flow's messages; `settled` counts missing messages as lost."""
-    ends = {
-        "taken": sum(one.taken for one in inputs),
-        "replaced": sum(one.replaced for one in inputs),
-        "dropped": sum(one.dropped for one in inputs),
-    }
+    ends = {name: sum(getattr(one, name) for one in inputs) for name in ENDS}
     waiting = sum(one.waiting for one in inputs)
     there = sum(ends.values()) + waiting
     # The receiver may have reported later than the sender.
