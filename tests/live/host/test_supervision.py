@@ -249,7 +249,9 @@ def test_processes_outlive_their_agent_and_the_next_one_adopts_them(
 
 
 def test_a_mark_of_another_process_is_not_believed(tmp_path: Path, said: list[str]) -> None:
-    (tmp_path / "stamper@R1.pid").write_text(f'{{"pid": {os.getpid()}, "started": 12.5, "session": 1}}')
+    (tmp_path / "stamper@R1.pid").write_text(
+        f'{{"pid": {os.getpid()}, "started": 12.5, "session": 1}}'
+    )
     supervisor = supervise(tmp_path, said.append)
     child = keep(supervisor, "stamper@R1", "import time; time.sleep(1000)")
     assert child.process is None

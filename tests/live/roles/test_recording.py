@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 import dwell
 from dwell.cli.commands import app
 from dwell.errors import LiveError
+from dwell.live.host.hosting import PLAIN
 from dwell.live.host.node import run_controller
 from dwell.model import Problem
 from dwell.record import open_run
@@ -184,7 +185,17 @@ def test_runs_that_can_go_nowhere_end_the_controller_before_it_begins(
 ) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(LiveError, match=r"file/runs: cannot be made \(Not a directory\)"):
-        run_controller([problem], tmp_path / "file" / "runs", threading.Event())
+        run_controller(
+            *([problem], tmp_path / "file" / "runs", threading.Event()),
+            keepers={},
+            continues={},
+            policy=None,
+            name=None,
+            jobs=False,
+            environment={},
+            platform=PLAIN,
+            say=print,
+        )
 
 
 def report(folder: Path) -> str:

@@ -19,7 +19,7 @@ import msgspec
 from dwell.control import Controller
 from dwell.errors import KernelError, LiveError
 from dwell.live.host.agent import Agent, Gauge, busy_ns_of
-from dwell.live.host.hosting import PLAIN, Hosted, Platform, keep_collections_short, take_turns
+from dwell.live.host.hosting import Hosted, Platform, keep_collections_short, take_turns
 from dwell.live.host.kept_cell import CellKeeper
 from dwell.live.host.launcher import ForkServer
 from dwell.live.host.security import Security
@@ -61,14 +61,14 @@ def run_agent(
     words: Callable[[str], Sequence[str]],
     stopped: threading.Event,
     *,
-    hurried: threading.Event | None = None,
-    keeper: CellKeeper | None = None,
-    renews: bool = False,
-    cpus: Iterable[int] | None = None,
-    accelerator: Callable[[], float] | None = None,
-    environment: Mapping[str, str] | None = None,
-    platform: Platform = PLAIN,
-    say: Callable[[str], None] = print,
+    hurried: threading.Event,
+    keeper: CellKeeper,
+    renews: bool,
+    cpus: Iterable[int] | None,
+    accelerator: Callable[[], float] | None,
+    environment: dict[str, str],
+    platform: Platform,
+    say: Callable[[str], None],
 ) -> None:
     """Keep a node's processes running until `stopped` is set; then end them.
 
@@ -78,18 +78,18 @@ def run_agent(
         Command of the fork server (`ForkServer`).
     words : callable
         Returns the arguments of a process from its name.
-    hurried : Event, optional
+    hurried : Event
         If set, the processes end at once instead of cleanly.
-    keeper : CellKeeper, optional
-        Keeps the copy of the cell file for the processes, which otherwise read the file itself.
+    keeper : CellKeeper
+        Keeps the copy of the cell file for the processes.
     renews : bool
         Whether to restart the running processes of a previous agent.
     accelerator : callable, optional
         Returns the utilisation of the node's accelerators, from 0 to 1. Used only if the cell file
         gives the node exactly one kind of accelerator.
-    environment : mapping of str to str, optional
-        Environment of the node's processes, with the variables of `dwell.live.host.security`
-        [default: this process's environment].
+    environment : dict of str to str
+        Environment of the node's processes, with the variables of `dwell.live.host.security`; the
+        variables of systemd are removed, which the processes must not inherit.
 
     Raises
     ------
@@ -108,8 +108,6 @@ def run_agent(
         say(unused)
     wiring = wire(problem)
     who = f"agent@{node}"
-    # `Service` removes the variables of systemd, which the processes must not inherit.
-    environment = dict(os.environ if environment is None else environment)
     service = Service(who, environment)
     security = Security.of(problem, wiring.entry(who).role, environment)
     security.remember(make_folder(folder))
@@ -124,8 +122,7 @@ def run_agent(
     place = security.place(who, node, transport, Log(say))
     place.slots = BeatFiles(folder, who)
     # Copy the cell only now: if the start has failed, the user can correct the file.
-    if keeper is not None:
-        keeper.begin(stopped)
+    keeper.begin(stopped)
     launcher = ForkServer(program, environment)
     supervisor = Supervisor(make_folder(folder), say, launcher)
     try:
@@ -134,9 +131,8 @@ def run_agent(
                 supervisor.keep(role.who, words(role.who))
         gauge = None if accelerator is None else Gauge(accelerator)
         stages = partial(read_books, problem, wiring.on(node), folder)
-        changed = str if keeper is None else keeper.told
         busy_ns = _busy_clock(problem, node, say)
-        agent = Agent(place, supervisor, busy_ns, gauge, stages, changed)
+        agent = Agent(place, supervisor, busy_ns, gauge, stages, keeper.told)
         clock, complain = platform.clock(problem, node), place.complain
         hosted = Hosted(agent, transport, clock, stopped=stopped, complain=complain)
         supervisor.ends.wake = hosted.wake_now
@@ -153,16 +149,15 @@ def run_agent(
             each_turn.append(renewal.step)
         keep_collections_short()
         service.ready()
-        if keeper is not None:
-            keeper.renew = supervisor.restart_in_turn
-            if renews:
-                supervisor.restart_in_turn()
+        keeper.renew = supervisor.restart_in_turn
+        if renews:
+            supervisor.restart_in_turn()
         take_turns([hosted], each_turn)
-        if keeper is not None and not keeper.replaced:
+        if not keeper.replaced:
             keeper.end()
     finally:
         service.stopping()
-        if keeper is not None and keeper.replaced:
+        if keeper.replaced:
             launcher.stop()  # the processes continue: the next agent supervises them
             failed = {}
         else:
@@ -201,14 +196,14 @@ def run_controller(
     out: Path,
     stopped: threading.Event,
     *,
-    keepers: Mapping[str, CellKeeper] | None = None,
-    continues: Mapping[str, Continued] | None = None,
-    policy: str | None = None,
-    name: str | None = None,
-    jobs: bool = False,
-    environment: Mapping[str, str] | None = None,
-    platform: Platform = PLAIN,
-    say: Callable[[str], None] = print,
+    keepers: Mapping[str, CellKeeper],
+    continues: Mapping[str, Continued],
+    policy: str | None,
+    name: str | None,
+    jobs: bool,
+    environment: dict[str, str],
+    platform: Platform,
+    say: Callable[[str], None],
 ) -> dict[str, Continued]:
     """Control cells until `stopped` is set; return their runs by cell name.
 
@@ -216,9 +211,9 @@ def run_controller(
     ----------
     out : Path
         Folder for the runs' folders.
-    keepers : mapping of str to CellKeeper, optional
+    keepers : mapping of str to CellKeeper
         Keepers of the cell files, by cell name.
-    continues : mapping of str to Continued, optional
+    continues : mapping of str to Continued
         Runs to continue after edited cell files, by cell name.
     policy : str, optional
         Policy of all cells [default: the policy of each cell file].
@@ -226,8 +221,8 @@ def run_controller(
         Name that distinguishes this controller from rivals.
     jobs : bool
         Whether to record the jobs and the CPU time of each process.
-    environment : mapping of str to str, optional
-        Contains the variables of `dwell.live.host.security` [default: this process's environment].
+    environment : dict of str to str
+        Contains the variables of `dwell.live.host.security`.
 
     Raises
     ------
@@ -252,7 +247,6 @@ def run_controller(
     # Switch threads often, so messages are read while the end of a window is processed.
     sys.setswitchinterval(0.0005)
     recorders: dict[str, tuple[RunRecorder, ControlledCell]] = {}
-    environment = dict(os.environ if environment is None else environment)
     service = Service(f"controller@{problems[0].controller_node}", environment)
     with ExitStack() as stack:
         hosted, hurry, each_turn = [], threading.Event(), [service.step]
@@ -265,15 +259,13 @@ def run_controller(
             place = security.place(f"controller@{node}", node, transport, Log(say))
             stack.callback(_close, place)
             controller = controller_of(problem, policy, say)
-            before = (continues or {}).get(problem.name, Continued())
+            before = continues.get(problem.name, Continued())
             folder = before.folder and Path(before.folder).name
             recorder = RunRecorder(out, problem, controller, say, jobs=jobs, continues=folder)
             clock = platform.clock(problem, node)
-            changed: Callable[[], str] = str
-            if (keeper := (keepers or {}).get(problem.name)) is not None:
-                keeper.begin(stopped)
-                changed = keeper.told
-            cell = ControlledCell(place, controller, recorder, name, time.time_ns(), changed)
+            keeper = keepers[problem.name]
+            keeper.begin(stopped)
+            cell = ControlledCell(place, controller, recorder, name, time.time_ns(), keeper.told)
             cell.pinned, cell.drained = before.pinned, {*before.drained}
             hosted.append(
                 Hosted(
