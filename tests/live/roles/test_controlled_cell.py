@@ -72,7 +72,8 @@ def test_a_controller_that_is_not_in_charge_refuses_and_names_the_one_that_is(
         assert ask(world, what, about) == "another controller: laptop is in charge"
     assert ask(world, "status") == ""
     world.run(3_000)
-    assert (world.cell.pinned, world.cell.drained, world.stamper.placement) == ("", set(), "LOC")
+    wishes = world.cell.wishes
+    assert (wishes.pinned, wishes.drained, world.stamper.placement) == ("", set(), "LOC")
     # It takes charge again when the other one is silent.
     assert ask(world, "pin", "SO") == ""
 

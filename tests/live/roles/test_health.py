@@ -156,7 +156,7 @@ def test_of_a_node_that_is_drained_nothing_need_be_heard(problem: Problem) -> No
     cell = replace(problem, live=replace(problem.live, relay="R1"))
     world = running(cell)
     role = world.cell
-    role.drained.add("E")
+    role.wishes.drained.add("E")
     for process in roles(world.problem):
         if process.node == "E" and process.kind != "controller":
             world.kill(process.who)
@@ -168,7 +168,7 @@ def test_another_version_on_a_node_that_is_drained_is_named_and_no_fault(
     problem: Problem,
 ) -> None:
     world = running(problem)
-    world.cell.drained.add("R2")
+    world.cell.wishes.drained.add("R2")
     found = world.status
     why = "planning@R2 runs Dwell 9.9"
     found["strangers"] = {"planning@R2": why, "planning@R2.shadow": why}
@@ -317,7 +317,7 @@ def test_a_shadows_stage_that_fails_is_the_reason(problem: Problem) -> None:
 def test_shadows_through_a_node_that_is_drained_may_fail(problem: Problem) -> None:
     settings = replace(problem.controller, estimator="shadow", shadow_fraction=0.2)
     world = running(replace(problem, controller=settings))
-    world.cell.drained.add("E")
+    world.cell.wishes.drained.add("E")
     for who in ("perception@E.shadow", "planning@E.shadow"):
         world.kill(who)
     world.run(2_000)

@@ -266,7 +266,7 @@ def run_controller(
             keeper = keepers[problem.name]
             keeper.begin(stopped)
             cell = ControlledCell(place, controller, recorder, name, time.time_ns(), keeper.told)
-            cell.pinned, cell.drained = before.pinned, {*before.drained}
+            cell.wishes.pinned, cell.wishes.drained = before.pinned, {*before.drained}
             hosted.append(
                 Hosted(
                     *(cell, transport, clock),
@@ -334,4 +334,5 @@ class _AsSeen:
 def _finished(recorder: RunRecorder, cell: ControlledCell) -> Continued:
     cell.write()
     folder = recorder.finish(cell.finish())
-    return Continued(str(folder) if folder else "", cell.pinned, tuple(sorted(cell.drained)))
+    wishes = cell.wishes
+    return Continued(str(folder) if folder else "", wishes.pinned, tuple(sorted(wishes.drained)))

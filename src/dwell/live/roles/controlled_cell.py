@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, Protocol, TypeAlias
 
 from dwell.control import Controller, Proposal
@@ -16,6 +17,7 @@ from dwell.errors import LiveError
 from dwell.live.roles.health import PATIENCE_NS, diagnose, silent_after_ns
 from dwell.live.roles.live_windows import LiveWindows
 from dwell.live.roles.members_status import members_status
+from dwell.live.roles.operator_wishes import OperatorWishes
 from dwell.live.roles.role import CONTROLLER_BEAT, REPEATED_NS, Pulse, RolePlace
 from dwell.live.roles.run_rows import Resume, Rows
 from dwell.live.wire import channels
@@ -127,8 +129,7 @@ class ControlledCell:
         self._unconfirmed: tuple[tuple[int, int, str], bool, int] | None = None
         self._doubted_until_ns: int | None = None
         self.refused = ""
-        self.pinned = ""
-        self.drained: set[str] = set()
+        self.wishes = OperatorWishes(place.problem)
         self._move: _Move | None = None
         self.order_number = now_ns
         self._setback = SetbackDetector()
@@ -446,14 +447,14 @@ class ControlledCell:
         if not self.course.by_guard:
             return ""
         chosen = self._allowed(here, now_ns)
-        if self.pinned or chosen != here:
+        if self.wishes.pinned or chosen != here:
             return "" if chosen == here else chosen
-        return wanted if wanted is not None and self._clear(wanted) else ""
+        return wanted if wanted is not None and self.wishes.allow(wanted) else ""
 
     def _begin(self, name: str, now_ns: int, proposal: Proposal | None = None) -> None:
         """Begin a migration that the policy has proposed or an operator has requested."""
         if self._move is not None:
-            self._stay(self._overruled())
+            self._stay(self.wishes.why())
         problem = self.place.problem
         old, new = (problem.candidates[one] for one in (self.course.placement, name))
         # A state moves, or is copied, to each node that is new to its task.
@@ -464,7 +465,7 @@ class ControlledCell:
             if task.state_bytes and node not in nodes_of(old[task.name])
         )
         phase: Phase = "fork" if forks else "order"
-        wish: Reason = "pinned" if self.pinned else "drained"
+        wish: Reason = "pinned" if self.wishes.pinned else "drained"
         reason = wish if proposal is None else proposal.decision.reason
         patience_ns = PATIENCE_NS + self._transfer_ns(forks)
         self._move = _Move(
@@ -590,7 +591,7 @@ class ControlledCell:
         if course.leaves_unproven(target, proven):
             target = course.placement
         overruled = target != permitted and self.place.problem.live.mode == "control"
-        why = self._overruled() if overruled else None
+        why = self.wishes.why() if overruled else None
         if unproven:
             self.controller.hold(proposal, why)
         elif target != permitted:
@@ -619,24 +620,10 @@ class ControlledCell:
         return self.windows.record.rows(last=True)
 
     def _allowed(self, wanted: str, now_ns: int) -> str:
-        """Return the placement that pins, drains and the mode allow for a wanted placement."""
-        here, problem = self.course.placement, self.place.problem
-        if self.pinned:
-            return self.pinned
-        if problem.live.mode == "advise":
-            wanted = here
-        if self._clear(wanted):
-            return wanted
-        if self._clear(here):
-            return here
-        probed = (self._told.probed,) if self._told is not None and self._told.probed else ()
-        order = (*probed, *problem.controller.fallbacks, *problem.candidates)
-        clear: list[str] = [name for name in order if self._clear(name)]
-        return next((name for name in clear if self._workers_ready(name, now_ns)), clear[0])
-
-    def _clear(self, name: str) -> bool:
-        """Whether a candidate needs no node that is drained."""
-        return not self.drained & self.place.problem.candidates[name].nodes
+        """Return the placement that operators and the mode allow for a wanted placement."""
+        probed = "" if self._told is None else self._told.probed
+        ready = partial(self._workers_ready, now_ns=now_ns)
+        return self.wishes.allowed(wanted, self.course.placement, probed, ready)
 
     def _workers_ready(self, name: str, now_ns: int) -> bool:
         """Whether all workers of a candidate have sent a recent beat and are ready."""
@@ -644,12 +631,6 @@ class ControlledCell:
         workers = [f"{task}@{node}" for task, node in self.place.problem.candidates[name].sites]
         beats = [detector.last(who) for who in workers if detector.fresh(who, now_ns, silent_ns)]
         return len(beats) == len(workers) and all(beat is not None and beat.ready for beat in beats)
-
-    def _overruled(self) -> str:
-        """Return the reason that a decision is not followed."""
-        if self.pinned:
-            return f"pinned to {self.pinned}"
-        return f"{', '.join(sorted(self.drained))} drained" if self.drained else "not proven"
 
     # ----------------------------------------------------------------------- operators
 
@@ -659,31 +640,15 @@ class ControlledCell:
         self.place.send(channels.ANSWER, answer, ask.number)
 
     def _do(self, ask: Ask, now_ns: int) -> str:
-        problem, told = self.place.problem, self._told
-        if ask.what != "status" and told is not None and told.refused.startswith(OTHER):
+        if ask.what == "status":
+            return ""
+        told = self._told
+        if told is not None and told.refused.startswith(OTHER):
             return told.refused
-        match ask.what:
-            case "status":
-                return ""
-            case "pin":
-                if ask.about not in problem.candidates:
-                    return f"no candidate {ask.about!r}; there are {', '.join(problem.candidates)}"
-                if needed := self.drained & problem.candidates[ask.about].nodes:
-                    return f"{ask.about} needs {', '.join(sorted(needed))}, which is drained"
-                self.pinned = ask.about
-            case "unpin":
-                self.pinned = ""
-            case "drain":
-                if refused := self._drain(ask.about):
-                    return refused
-            case "undrain":
-                if ask.about not in problem.fabric.nodes:
-                    return f"no node {ask.about!r}; there are {', '.join(problem.fabric.nodes)}"
-                self.drained.discard(ask.about)
-            case _:
-                return f"unknown question {ask.what!r}"
-        self._follow_operators(now_ns)
-        return ""
+        refused = self.wishes.take(ask.what, ask.about)
+        if not refused:
+            self._follow_operators(now_ns)
+        return refused
 
     def _follow_operators(self, now_ns: int) -> None:
         """Begin an operator's move; from a fallback only to a proven candidate."""
@@ -696,18 +661,6 @@ class ControlledCell:
             return
         if target not in (here, under_way):
             self._begin(target, now_ns)
-
-    def _drain(self, node: str) -> str:
-        problem = self.place.problem
-        if node not in problem.fabric.nodes:
-            return f"no node {node!r}; there are {', '.join(problem.fabric.nodes)}"
-        drained = {*self.drained, node}
-        if all(drained & placed.nodes for placed in problem.candidates.values()):
-            return f"every candidate needs {node}; nothing could run"
-        if self.pinned and node in problem.candidates[self.pinned].nodes:
-            return f"the cell is pinned to {self.pinned}, which needs {node}; unpin it first"
-        self.drained = drained
-        return ""
 
     def status(self, now_ns: int) -> dict[str, Any]:
         """Return the status of the cell, as plain values."""
@@ -727,8 +680,8 @@ class ControlledCell:
             "fallback": course.by_guard,
             "resting": course.by_guard if told is None else told.resting,
             "wanted": course.wanted,
-            "pinned": self.pinned or None,
-            "drained": sorted(self.drained),
+            "pinned": self.wishes.pinned or None,
+            "drained": sorted(self.wishes.drained),
             "proving": self._proving(now_ns),
             "moving_to": move.name if move is not None and not move.refused else None,
             "refused": self.refused or None,
