@@ -26,7 +26,7 @@ from dwell.errors import LiveError, ProblemError
 from dwell.live.host.kept_cell import Change, KeptCell, cell_here, change, forget
 from dwell.live.host.node_processes import NodeProcesses
 from dwell.live.host.operator_client import OperatorClient
-from dwell.live.host.process_group import ProcessGroup
+from dwell.live.host.process_group import ProcessGroup, end_processes
 from dwell.live.host.security import Security
 from dwell.live.host.stage_modules import require_stages
 from dwell.live.host.state_files import make_folder
@@ -443,17 +443,9 @@ def down(problem: Problem, folder: Path) -> list[str]:
 
 
 def _end(processes: Mapping[str, psutil.Process]) -> list[str]:
-    """Send SIGTERM to processes, and SIGKILL after `END_S`; return the names of the killed."""
-    for process in processes.values():
-        for number in (signal.SIGTERM, signal.SIGCONT):
-            with suppress(psutil.NoSuchProcess):
-                process.send_signal(number)
-    _, alive = psutil.wait_procs(list(processes.values()), timeout=END_S)
-    for process in alive:
-        with suppress(psutil.NoSuchProcess):
-            process.kill()
-    psutil.wait_procs(alive, timeout=END_S)
-    return [who for who, process in processes.items() if process in alive]
+    """End processes, and kill them after `END_S`; return the names of the killed."""
+    killed = end_processes(processes.values(), END_S)
+    return [who for who, process in processes.items() if process in killed]
 
 
 # ------------------------------------------------------------------------- log

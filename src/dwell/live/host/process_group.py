@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -16,6 +18,8 @@ import psutil
 
 #: Largest difference between two readings of one start time, s.
 SAME_S = 0.05
+#: Period of the checks of processes that are ending.
+LOOK_S = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +79,31 @@ class ProcessGroup:
                 later = started > self.started - SAME_S
                 if same and later and process.status() != psutil.STATUS_ZOMBIE:
                     yield process
+
+
+def end_processes(
+    processes: Collection[psutil.Process],
+    patience_s: float,
+    *,
+    hurried: threading.Event | None = None,
+) -> list[psutil.Process]:
+    """Send SIGTERM to processes, even to stopped ones; kill and return those that do not end.
+
+    They are killed after `patience_s`, or when `hurried` is set.
+    """
+    for process in processes:
+        for number in (signal.SIGTERM, signal.SIGCONT):
+            with suppress(psutil.Error):
+                process.send_signal(number)
+    deadline_s = time.monotonic() + patience_s
+    alive = list(processes)
+    while alive and time.monotonic() < deadline_s and not (hurried and hurried.is_set()):
+        _, alive = psutil.wait_procs(alive, timeout=min(LOOK_S, patience_s))
+    for process in alive:
+        with suppress(psutil.Error):
+            process.kill()
+    psutil.wait_procs(alive, timeout=patience_s)
+    return alive
 
 
 def end_helpers() -> None:

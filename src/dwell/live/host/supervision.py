@@ -22,7 +22,7 @@ from dwell.errors import LiveError
 from dwell.files import write_whole
 from dwell.live.host.launcher import UNKNOWN_CODE, ForkServer, Running, Survivor
 from dwell.live.host.process_ends import ProcessEnds
-from dwell.live.host.process_group import ProcessGroup
+from dwell.live.host.process_group import ProcessGroup, end_processes
 from dwell.live.host.state_files import InFlight, make_folder, open_own
 from dwell.live.log import printable
 
@@ -32,8 +32,6 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.05, 5.0
 STOP_S = 3.5
 #: Longest wait for a restarted process to be ready, before the next process is restarted.
 TURN_S = 30.0
-#: Period of the checks of processes that are ending.
-LOOK_S = 0.1
 #: Lifetime after which a process has recovered.
 HEALTHY_S = 10.0
 #: Number of deaths at one message after which the message is quarantined.
@@ -393,16 +391,7 @@ class Supervisor:
         running = [
             psutil.Process(c.pid) for c in self.children if c.pid and psutil.pid_exists(c.pid)
         ]
-        for process in running:
-            _signal(process, signal.SIGTERM)
-            _signal(process, signal.SIGCONT)
-        deadline_s = time.monotonic() + patience_s
-        alive = running
-        while alive and time.monotonic() < deadline_s and not (hurried and hurried.is_set()):
-            _, alive = psutil.wait_procs(alive, timeout=min(LOOK_S, patience_s))
-        for process in alive:
-            _signal(process, signal.SIGKILL)
-        psutil.wait_procs(alive, timeout=patience_s)
+        end_processes(running, patience_s, hurried=hurried)
         failed = {}
         for child in self.children:
             if child.process is not None:
@@ -429,11 +418,6 @@ class Supervisor:
 def _send(pid: int, number: int) -> None:
     with suppress(ProcessLookupError):
         os.kill(pid, number)
-
-
-def _signal(process: psutil.Process, number: int) -> None:
-    with suppress(psutil.Error):
-        process.send_signal(number)
 
 
 def write_mark(mark: Path, group: ProcessGroup | None) -> None:
