@@ -58,7 +58,6 @@ def test_a_flood_of_frames_makes_two_cycles_a_period(problem: Problem) -> None:
         stamper.receive(Arrival(key, b""), world.network.now_ns)
         world.run(period_ms / 100)
     assert 19 <= stamper.cycle <= 20
-    assert stamper.skipped == 1_000 - stamper.cycle
 
 
 # ------------------------------------------------------------------ a book that is gone or old

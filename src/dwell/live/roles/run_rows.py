@@ -234,17 +234,14 @@ class RunRows:
         for row, cycle in self._in_flight.items():
             if self._outcome(cycle) != cycle.outcome:
                 self._changed[row] = cycle
-        for number in self._changed_windows & self._windows.keys():
-            window = self._windows[number]
+        numbers = sorted(self._changed_windows & self._windows.keys())
+        windows = [self._windows[number] for number in numbers]
+        for window in windows:
             self.ages.judge(window.cycles, window.close_ns, self._origins_before(window))
         decided = (decision_values(self._controller, row) for row in self._controller.decisions)
         values: dict[str, Iterable[Values]] = {
             "cycles": [self._cycle_values(self._changed[row]) for row in sorted(self._changed)],
-            "windows": [
-                self._window_values(self._windows[number])
-                for number in sorted(self._changed_windows)
-                if number in self._windows
-            ],
+            "windows": [self._window_values(window) for window in windows],
             "decisions": list(decided if last else takewhile(self._is_recorded, decided)),
             **(self._job_values(last=last) if self._jobs else {}),
         }

@@ -95,10 +95,8 @@ class SampledInputs:
 
     def stamped(self, stamp: Stamp) -> None:
         """Follow the task to its node under a stamp, unless a newer one is known."""
-        placed, order = (
-            self._place.problem.candidates.get(stamp.placement),
-            (*stamp.key, stamp.term),
-        )
+        placed = self._place.problem.candidates.get(stamp.placement)
+        order = (*stamp.key, stamp.term)
         if placed is None or order <= self._newest:
             return
         was_here, self._newest = not self.is_away, order

@@ -132,7 +132,6 @@ class Stamper:
         self.newest_order = 0
         #: CPU time that this process's control group has used, if the kernel counts it.
         self.group_clock: Callable[[], int] = lambda: UNKNOWN
-        self.skipped = 0
         self.moves: list[tuple[int, str, str]] = []
         # Placement before the first of these moves.
         self._first = entry.placement
@@ -191,7 +190,6 @@ class Stamper:
         if self.timer or not self._begun:
             return
         if now_ns - self._framed_ns < self.place.period_ns // 2:
-            self.skipped += 1
             return
         self._framed_ns = now_ns
         self._release(now_ns, now_ns)
@@ -357,17 +355,12 @@ class Stamper:
             return
         if order.number > self.newest_order:
             self.newest_order = order.number
-            self._settle(order)
+            self.shadow_fraction, self.forks = order.shadow_fraction, order.forks
+            if self.course.by_guard:
+                known = order.want in self.place.problem.candidates
+                self.guard.probation.want(order.want if known else None)
         if order.placement and (order.placement != self.placement or self.course.by_guard):
             self._move(order.placement, by_guard=False)
-
-    def _settle(self, order: Order) -> None:
-        """Adopt the shadow fraction, the forks and the wanted candidate of the newest order."""
-        self.shadow_fraction = order.shadow_fraction
-        self.forks = order.forks
-        if self.course.by_guard:
-            known = order.want in self.place.problem.candidates
-            self.guard.probation.want(order.want if known else None)
 
     def _move(self, placement: str, *, by_guard: bool) -> None:
         """Change the placement: begin a new term, saved before any cycle has it."""
@@ -403,11 +396,10 @@ class Stamper:
             self._move(fallback, by_guard=True)
             self.pulse.send(now_ns)
         if self.timer and now_ns >= self._next_ns:
-            behind = (now_ns - self._next_ns) // self.place.period_ns
-            self.skipped += behind
-            self._next_ns += behind * self.place.period_ns
-            self._release(self._next_ns, now_ns)
-            self._next_ns += self.place.period_ns
+            # Of several periods that are due, only the last releases a cycle.
+            released_ns = now_ns - (now_ns - self._next_ns) % self.place.period_ns
+            self._next_ns = released_ns + self.place.period_ns
+            self._release(released_ns, now_ns)
         due_ns = min(self.pulse.wake(now_ns), self._miss(now_ns))
         if self.timer:
             due_ns = min(due_ns, self._next_ns)

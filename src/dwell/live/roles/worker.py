@@ -133,7 +133,6 @@ class Worker:
         self._busy_cycle = 0
         self._chore: Chore | None = None
         self.replaced = 0
-        self.failures = 0
         # Number of calls of process() in a row without an output to send; end of the last one.
         self._failed_in_a_row, self._failed_ns = 0, 0
         self._now_ns = 0
@@ -541,7 +540,6 @@ class Worker:
     def _failed(self, what: str) -> str:
         """Report a failure of the stage; return its text."""
         self.trouble = f"{self.task} on {self.place.node}: {what}"
-        self.failures += 1
         self.place.complain(LiveError(self.trouble))
         return self.trouble
 
