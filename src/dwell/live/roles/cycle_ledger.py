@@ -7,14 +7,11 @@ unless a worker reports that a newer cycle replaced it.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TypeAlias
 
 import msgspec
-import numpy as np
 
-from dwell.live.roles.loads import NodeLoad
 from dwell.live.roles.offsets import UNBOUNDED_NS, Offsets
 from dwell.live.wire.messages import (
     ACTUATED,
@@ -31,9 +28,7 @@ from dwell.live.wire.messages import (
 from dwell.live.wire.routing import Routes
 from dwell.live.wire.wiring import lane_of
 from dwell.model import Execution, Flow, Problem
-from dwell.model.fabric import accelerator_name
 from dwell.model.instants import NEVER_NS
-from dwell.model.number_arrays import Floats
 from dwell.record import Values
 
 #: Whether the job belongs to the shadow; task and node.
@@ -45,8 +40,6 @@ Jobs: TypeAlias = dict[JobName, Hop]
 UNKNOWN = -1
 #: Largest number of shadow completions kept per cycle.
 MAX_SHADOWS = 16
-#: Least share of a window in which a hook must have measured an accelerator.
-HOOKED_SHARE = 0.5
 #: Outcomes of jobs that ended before a sink.
 SHADOW, REPLACED = "shadow", "replaced"
 #: Outcomes of messages that begin no job whose output counts.
@@ -277,9 +270,6 @@ class Ledger:
         self.routes = Routes(problem)
         self._pipeline, self._candidates, self._offsets = pipeline, problem.candidates, offsets
         self._stamper_node = problem.stamper_node
-        self._nodes, self._resources = problem.fabric.nodes, problem.fabric.resources
-        #: CPU and accelerator time by node.
-        self.loads = {node: NodeLoad() for node in self._nodes}
         self.tasks = {name: column for column, name in enumerate(pipeline.tasks)}
         self.flows = {(f.source, f.target): column for column, f in enumerate(pipeline.flows)}
         self._sampled = {(f.source, f.target) for f in pipeline.flows if f.sampled}
@@ -287,7 +277,6 @@ class Ledger:
         order = pipeline.topological()
         #: Flows in the order of their sources in the pipeline.
         self.forward = sorted(pipeline.flows, key=lambda flow: order.index(flow.source))
-        self._accelerated = {name: self._accelerators(name) for name in self._candidates}
 
     def cycle_of(self, stamp: Stamp, origin_ns: int, *, heard: bool = True) -> LiveCycle:
         """Return the cycle of a stamp; without `heard`, of a stamp that its neighbours imply."""
@@ -467,95 +456,14 @@ class Ledger:
 
     # --------------------------------------------------------------------------- jobs
 
-    def core_ns(self, cycles: Sequence[LiveCycle], close_ns: int) -> Floats:
-        """Core-nanoseconds of every resource in a window: all, own, shadows; shape (3, resources).
-
-        A node's own work is the CPU time of its jobs, if jobs report it. Messages and beats of
-        their processes do not count as own work, because no candidate's estimate contains them.
-        The busy time of accelerators comes from a hook if their node has one kind of accelerator
-        and the hook measured it long enough; otherwise from the cell's jobs. Unknown values are
-        NaN.
-        """
-        jobs_ns = self.spent_ns(cycles)
-        by_jobs = self.accelerator_ns(cycles) if len(self._resources) > len(self.loads) else {}
-        used = np.zeros((3, len(self._resources)))
-        hooked: dict[str, float] = {}
-        for column, (node, load) in enumerate(self.loads.items()):
-            begin_ns, end_ns = self.span_ns(node, cycles[0], close_ns)
-            *counted_ns, busy_ns, told_ns = load.at(end_ns) - load.at(begin_ns)
-            used[:, column] = counted_ns
-            if jobs_ns:
-                used[1, column] = jobs_ns[node]
-            kinds = self._nodes[node].accelerators.items()
-            if len(kinds) == 1 and told_ns >= HOOKED_SHARE * (end_ns - begin_ns):
-                ((kind, count),) = kinds
-                busy = count * (close_ns - cycles[0].at_ns) * busy_ns / told_ns
-                hooked[accelerator_name(node, kind)] = busy
-        for column, name in enumerate(self._resources):
-            if column >= len(self.loads):
-                own_ns, shadow_ns = by_jobs.get(name, (0.0, 0.0))
-                busy_ns = hooked.get(name, own_ns + shadow_ns)
-                used[:, column] = busy_ns, own_ns, shadow_ns
-        return used
-
-    def forget(self, before: LiveCycle) -> None:
-        """Drop load reports that only earlier cycles need."""
-        for node, load in self.loads.items():
-            load.forget(self.span_ns(node, before, before.at_ns)[0])
-
-    def spent_ns(self, cycles: Sequence[LiveCycle]) -> Counter[str]:
-        """Return the reported CPU time of the cycles' jobs, by node.
-
-        Tasks on an accelerator are left out: profiles do not count their CPU time as work.
-        """
-        spent = Counter[str]()
-        for cycle in cycles:
-            # Several sinks may report one job.
-            for hop in by_site(cycle.hops).values():
-                execution = self._execution(hop)
-                on_cpu = execution is not None and execution.accelerator is None
-                if hop.cpu_ns != UNKNOWN and on_cpu:
-                    spent[hop.node] += hop.cpu_ns
-        return spent
-
-    def accelerator_ns(self, cycles: Iterable[LiveCycle]) -> dict[str, tuple[float, float]]:
-        """Return the time that jobs of the cycles, and of their shadows, used each accelerator.
-
-        Waiting for the accelerator counts, as the time runs from start to end of the job. The
-        first value is NaN for an accelerator of the placement for which no job reported a time.
-        """
-        own, shadow, placed = Counter[str](), Counter[str](), set[str]()
-        for cycle in cycles:
-            placed |= self._accelerated[cycle.placement]
-            for (is_shadow, *_), hop in self._jobs(cycle).items():
-                execution = self._execution(hop)
-                if execution is None or execution.accelerator is None or hop.ended_ns == UNKNOWN:
-                    continue
-                spent = shadow if is_shadow else own
-                spent[execution.resource(hop.node)] += self.work_ns(hop)
-        return {
-            name: (
-                float(own[name]) if name in own or name not in placed else math.nan,
-                shadow[name],
-            )
-            for name in {*own, *shadow, *placed}
-        }
-
-    def _accelerators(self, candidate: str) -> frozenset[str]:
-        """Return the resource names of the accelerators that a candidate's tasks run on."""
-        placed = self._candidates[candidate].sites
-        executions = ((self._pipeline.tasks[task].on[node], node) for task, node in placed)
-        used = (one.resource(node) for one, node in executions if one.accelerator is not None)
-        return frozenset(used)
-
-    def _execution(self, hop: Hop) -> Execution | None:
+    def execution(self, hop: Hop) -> Execution | None:
         """Return the execution of a job's task on its node, or None."""
         task = self._pipeline.tasks.get(hop.task)
         return None if task is None else task.on.get(hop.node)
 
     def work_ns(self, hop: Hop) -> int:
         """CPU time of a job that has ended, or its time on an accelerator; else `UNKNOWN`."""
-        execution = self._execution(hop)
+        execution = self.execution(hop)
         if execution is None or hop.ended_ns == UNKNOWN:
             return UNKNOWN
         if execution.accelerator is None:
@@ -564,13 +472,13 @@ class Ledger:
 
     def jobs(self, cycle: LiveCycle) -> list[Values]:
         """Return the rows of ``jobs`` for the known jobs of a cycle and its shadow."""
-        jobs = self._jobs(cycle)
+        jobs = self.known_jobs(cycle)
         order = sorted(jobs, key=lambda key: (key[0], self.tasks[key[1]]))
         rows = (self._job_values(cycle, jobs, key) for key in order)
         return [row for row in rows if row is not None]
 
-    def _jobs(self, cycle: LiveCycle) -> Jobs:
-        """Jobs of a cycle and its shadow."""
+    def known_jobs(self, cycle: LiveCycle) -> Jobs:
+        """Return the known jobs of a cycle and its shadow."""
         jobs: Jobs = {}
         apart = self.routes.apart(cycle.placement, cycle.shadow)
         hops = [(hop, False) for hop in cycle.hops]

@@ -30,6 +30,7 @@ import numpy as np
 
 from dwell.control import ClosedWindow, Controller, LookedAt
 from dwell.errors import LiveError
+from dwell.live.roles.core_times import CoreTimes
 from dwell.live.roles.cycle_ledger import Ledger, LiveCycle, told, violation_rate
 from dwell.live.roles.data_ages import KnownOrigins
 from dwell.live.roles.live_evidence import LiveEvidence
@@ -106,6 +107,7 @@ class LiveWindows:
         self.heard = self.ignored = 0
         self._ledger = Ledger(problem, offsets)
         self._evidence = LiveEvidence(problem, self._ledger)
+        self._cores = CoreTimes(problem, self._ledger)
         self._symptoms = Symptoms(problem, self._ledger)
         self._processes = ProcessLoads()
         self._stages = StageTable(problem)
@@ -190,10 +192,10 @@ class LiveWindows:
 
     def loaded(self, load: Load, at_ns: int = 0) -> None:
         """Add an agent's report of its node, which arrived at `at_ns` on the controller's clock."""
-        if load.node in self._ledger.loads:
+        if load.node in self._cores.loads:
             if self._newest is not None:
                 self._stages.take(load, self._newest[0].key, at_ns)
-            self._ledger.loads[load.node].report(load)
+            self._cores.loads[load.node].report(load)
             if self._keeps_jobs:
                 self._processes.report(load.node, load.at_ns, load.processes)
         else:
@@ -435,7 +437,7 @@ class LiveWindows:
             self.looked, closed = self._close_window(first, unix_ns)
         if self.often:
             self.looked, closed = self._look(begin, end)
-        self._ledger.forget(oldest)
+        self._cores.forget(oldest)
         self._stretch.at = end
         self._forget_line(min(self._window.at, max(end - (self._size if self.often else 0), 0)))
         return closed
@@ -501,7 +503,7 @@ class LiveWindows:
             release_ns=np.array([cycle.at_ns for cycle in known], np.int64),
             close_ns=close_ns,
             open_ns=int(release_ns[0]),
-            core_ns=self._ledger.core_ns(cycles, close_ns),
+            core_ns=self._cores.core_ns(cycles, close_ns),
             looked=LookedAt(window, row, end - begin),
             evidence=partial(of_cycles, shadows=shadows, earlier=earlier),
             over_age=np.array([cycle.over_age for cycle in known], np.bool_),
