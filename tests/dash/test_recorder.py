@@ -14,7 +14,9 @@ import pytest
 
 from dwell.dash.observer import ObservedWindow
 from dwell.dash.recorder import CellRecorder
+from dwell.model import evolve
 from dwell.record.mcap_file import McapFile
+from tests.cells.small import make_problem
 from tests.dash.stand_in import PERIOD_NS, StandIn
 from tests.record.test_mcap_file import metadata, read
 
@@ -60,7 +62,9 @@ def of_topic(file: Path, topic: str) -> Iterator[tuple[int, dict[str, Any]]]:
 
 
 def test_what_is_heard_is_in_the_file_at_the_time_of_day(tmp_path: Path) -> None:
-    cell, file = StandIn(), tmp_path / "new" / "cell.mcap"
+    chain = {"from": "sensing", "to": "control"}
+    cell = StandIn(evolve(make_problem(), {"chains": {"see": chain}}))
+    file = tmp_path / "new" / "cell.mcap"
     before_ns = time.time_ns()
     with CellRecorder(cell.observer, file, print) as recorder:
         cell.cycle(0, 20, jobs=(JOB,))

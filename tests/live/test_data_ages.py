@@ -90,7 +90,7 @@ def test_the_status_has_ages_and_reaction_times_of_chains(every: int) -> None:
     names = "age_l95_see-act", "age_missed_see-act", "reaction_l95_see-act"
     steady = {*columns(world, "windows", *names)[2:]}
     assert len(steady) == 1
-    assert world.status["window"]["cycles"] == every
+    assert world.status["window"]["cycles"] == 2 * SLOW
     assert world.status["window"]["ages"] == dict(zip(names, *steady, strict=True))
 
 
