@@ -42,8 +42,6 @@ class _Silence:
         bound.
     """
 
-    __slots__ = ("kept", "newest", "patience_ns", "released", "waiting")
-
     def __init__(self, patience_ns: int, kept: int = 1) -> None:
         self.patience_ns, self.kept = patience_ns, kept
         self.waiting: deque[tuple[int, int]] = deque()
@@ -101,8 +99,6 @@ class _OriginSilence(_Silence):
         Cycles from one origin to the next.
     """
 
-    __slots__ = ("every",)
-
     def __init__(self, patience_ns: int, every: int) -> None:
         super().__init__(patience_ns)
         self.every = every
@@ -131,8 +127,6 @@ class FallbackRound:
     fallbacks : iterable of str
         Candidates, best first.
     """
-
-    __slots__ = ("_failed", "_tried", "fallbacks")
 
     def __init__(self, fallbacks: Iterable[str]) -> None:
         self.fallbacks = tuple(dict.fromkeys(fallbacks))
@@ -251,22 +245,6 @@ class Guard:
     newest : int
         Highest completed cycle, -1 for none.
     """
-
-    __slots__ = (
-        "_carrier",
-        "_chains",
-        "_rest",
-        "_rest_last",
-        "_rests",
-        "_returned",
-        "_round",
-        "_silence",
-        "_since",
-        "_spent_ns",
-        "_waits",
-        "course",
-        "probe_cycles",
-    )
 
     def __init__(
         self,
@@ -514,8 +492,6 @@ class Presence:
         Members of each candidate with replicas.
     """
 
-    __slots__ = ("_heard_ns", "members", "parts", "within_ns")
-
     def __init__(
         self,
         parts: Mapping[str, Collection[str]],
@@ -585,8 +561,6 @@ class Failures:
         Time after its release at which a cycle without a completion has failed.
     """
 
-    __slots__ = ("_through", "in_a_row")
-
     def __init__(self, candidates: Iterable[str], in_a_row: int, patience_ns: int) -> None:
         self.in_a_row = in_a_row
         self._through = {name: _Silence(patience_ns, kept=in_a_row) for name in candidates}
@@ -652,21 +626,6 @@ class Probation:
     wanted : str or None
         Placement of the probes.
     """
-
-    __slots__ = (
-        "_count",
-        "_first",
-        "_health",
-        "_on_fallback",
-        "_open",
-        "_returned",
-        "_silence",
-        "health_cycles",
-        "most",
-        "needed",
-        "probe_cycles",
-        "wanted",
-    )
 
     def __init__(self, probe_cycles: int, *, health_cycles: int, patience_ns: int) -> None:
         PROBE_CYCLES.check("probe_cycles", probe_cycles)
@@ -782,8 +741,6 @@ class CellGuard(Guard):
     probation : Probation
         Probes; the caller reports the wanted placement and the cycles completed under orders.
     """
-
-    __slots__ = ("_sink_rates", "failures", "presence", "probation")
 
     def __init__(self, problem: Problem, placement: str | None = None) -> None:
         settings, rates = problem.controller, problem.pipeline.rates

@@ -45,18 +45,6 @@ class Reference:
     `lost` the share of infinite values.
     """
 
-    __slots__ = (
-        "_extremes",
-        "_in_order",
-        "_patience_ms",
-        "block",
-        "likeness",
-        "lost",
-        "ordered",
-        "usual",
-        "values",
-    )
-
     def __init__(
         self,
         values: Floats,
@@ -144,8 +132,6 @@ class Pool:
 
     A disturbance adds to the values of a message (`additive`) and multiplies the values of a job.
     """
-
-    __slots__ = ("_alone", "_doubts", "_summary", "additive", "reference", "rows")
 
     #: Time of the first job if it was the only one in its window; else 0.
     _alone: float

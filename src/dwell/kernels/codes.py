@@ -53,19 +53,8 @@ class Tier(IntEnum):
 class EventKind(IntEnum):
     """Kinds of events, in the order of events at equal times."""
 
-    (
-        COMPLETION,
-        ARRIVAL,
-        START,
-        RETRY,
-        CHANGE,
-        RESTART,
-        MIGRATE,
-        CLOSE,
-        DECIDE,
-        GUARD,
-        RELEASE,
-    ) = range(11)
+    COMPLETION, ARRIVAL, START, RETRY, CHANGE, RESTART = range(6)
+    MIGRATE, CLOSE, DECIDE, GUARD, RELEASE = range(6, 11)
 
 
 # A key packs (kind, cell, cycle, item) and sorts like this tuple. The item depends on the kind: a

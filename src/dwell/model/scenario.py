@@ -94,10 +94,8 @@ class _Timed:
     def __post_init__(self) -> None:
         if self.ramp_s == 0:
             return
-        ramp_s, half = (
-            self.ramp_s,
-            f"at most half of for_s = {self.for_s:g}: it grows, and it falls",
-        )
+        ramp_s = self.ramp_s
+        half = f"at most half of for_s = {self.for_s:g}: it grows, and it falls"
         require(2 * ramp_s <= self.for_s, "ramp_s", ramp_s, half)
         require(self.episodes is None, "ramp_s", ramp_s, "left out with `episodes`")
         require(not self.down, "ramp_s", ramp_s, "left out with `down`, which has no strength")

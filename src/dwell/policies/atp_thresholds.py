@@ -23,7 +23,7 @@ from dwell.cost import TierUtilisation
 from dwell.errors import PolicyError
 from dwell.model.bounds import MIN_DWELL, Bound
 from dwell.model.objective import Objective, Tier
-from dwell.model.placement import Placement
+from dwell.model.placement import Placement, plain_candidates
 from dwell.model.problem import Problem
 from dwell.model.qos import Decision, QoS
 from dwell.policies.incumbent import PricingPolicy, check_name, check_parameter
@@ -42,8 +42,9 @@ class Pair(NamedTuple):
 def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -> tuple[Pair, ...]:
     """Return every pair of candidates that differ in the side of one task, in candidate order."""
     pairs = []
-    for local, here in _plain(candidates):
-        for offload, there in _plain(candidates):
+    plain = plain_candidates(candidates)
+    for local, here in plain.items():
+        for offload, there in plain.items():
             moved = here.moved(there)
             if len(moved) != 1:
                 continue
@@ -52,11 +53,6 @@ def find_pairs(candidates: Mapping[str, Placement], tiers: Mapping[str, Tier]) -
             if tiers.get(here.first[task]) == "robot" and outside:
                 pairs.append(Pair(local, offload, task))
     return tuple(pairs)
-
-
-def _plain(candidates: Mapping[str, Placement]) -> list[tuple[str, Placement]]:
-    """Return the candidates without replicas."""
-    return [(name, placed) for name, placed in candidates.items() if placed.second is None]
 
 
 class ATPThresholds(PricingPolicy):

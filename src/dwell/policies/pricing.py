@@ -77,16 +77,6 @@ def _shares(
 class Pricing:
     """Prices the candidates of one policy."""
 
-    __slots__ = (
-        "_cloud",
-        "_edge",
-        "_robot",
-        "_rows",
-        "_weighs",
-        "candidates",
-        "objective",
-    )
-
     def __init__(self, candidates: Mapping[str, Placement], objective: Objective) -> None:
         if not isinstance(objective, Objective):
             raise PolicyError(f"objective is {objective!r}; it must be an Objective")
