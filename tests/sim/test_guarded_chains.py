@@ -100,3 +100,9 @@ def test_it_returns_once_probes_of_detections_have_arrived() -> None:
     # E is back at 500: probes of the camera's releases at 500, 550, 600 and 650 arrive.
     found = play(cell(), down={"E": [(200, 500)]}, windows=24)
     assert placements(found) == [("OFF", 30), ("LOC", 40), ("OFF", 50)]
+
+
+def test_a_fallback_whose_node_was_down_is_tried_once_it_is_back_while_control_goes_on() -> None:
+    found = play(cell(fallbacks=("ALT",)), down={"E": [(200, 2000)], "X": [(100, 600)]}, windows=16)
+    assert moves(found) == [(12, "OFF", "ALT")]
+    assert placements(found) == [("OFF", 60), ("ALT", 20)]

@@ -95,9 +95,13 @@ class SimulatedGuard:
             for waits_for, patience_ns in guard.chain_waits
             for cycle in (waits_for, self._moved)
         ]
-        self._cell["chain_due_ns"] = min((at for at in chain_dues if at > now), default=LAST_NS)
         instants += chain_dues
-        self._wake_at(min((at for at in instants if at > now), default=LAST_NS))
+        wakes_ns = min((at for at in instants if at > now), default=LAST_NS)
+        # Completed cycles do not end the wait for a chain, so they must not put off a wake.
+        is_over = any(self._due_ns(*wait) <= now for wait in guard.chain_waits)
+        chain_ns = min((at for at in chain_dues if at > now), default=LAST_NS)
+        self._cell["chain_due_ns"] = wakes_ns if is_over else chain_ns
+        self._wake_at(wakes_ns)
 
     def _due_ns(self, cycle: int, patience_ns: int | None = None) -> int:
         """Return the instant at which a cycle is as old as a patience, by default for cycles."""
