@@ -62,6 +62,19 @@ def test_idle_cycles_are_recorded_and_count_in_no_metric() -> None:
     assert (world.status["health"], world.status["headline"]) == ("ok", None)
 
 
+def test_a_cycle_is_actuated_if_all_sinks_have_applied_it() -> None:
+    world = world_of(rated(), policy=Staying())
+    world.run(500)
+    world.kill("sink.arm@R")
+    dead = world.stamper.cycle
+    world.run(500)
+    rows = columns(world, "cycles", "number", "actuated")
+    late = [actuated for number, actuated in rows if number > dead and not number % SLOW]
+    assert late == [False] * len(late)
+    assert len(late) > 2
+    assert all(actuated for number, actuated in rows if number % SLOW)
+
+
 def test_jobs_that_send_no_message_are_known() -> None:
     world = world_of(rated(idle=True), policy=Staying(), jobs=True)
     world.run(1_000)

@@ -290,7 +290,7 @@ class RunRows:
             "term": cycle.term,
             "lead": cycle.window is None,
             "heard": cycle.heard,
-            "actuated": cycle.actuated,
+            "actuated": self._ledger.complete(cycle) and cycle.actuated,
             "interval_ns": cycle.interval_ns,
             "stamper_interval_ns": cycle.stamper_interval_ns,
             "bound_ns": None if cycle.bound_ns >= UNBOUNDED_NS else cycle.bound_ns,
