@@ -260,6 +260,32 @@ def test_three_rates_survive_the_death_of_each_worker() -> None:
     assert log.samples[-1] != log.samples[-20]
 
 
+def test_a_worker_that_was_frozen_uses_no_value_older_than_its_standby_did() -> None:
+    on: dict[str, Any] = {"R": {"exec_ms": 1}}
+    tasks: dict[str, Any] = {name: {"on": on} for name in ("imu", "detect", "act")}
+    tasks["camera"] = {"every": SLOW, "on": on}
+    tasks["control"] = {"on": {"R": {"exec_ms": 1, "standby": 1}}}
+    problem, log = sampling(tasks=tasks, candidates={"LOC": {}}, controller={"on": "E"}), Log()
+    exec_ms = dict.fromkeys(tasks, 1.0) | {"control": 0.1}
+    world = World(problem, exec_ms=exec_ms, stages={"control": log.stage})
+    world.run(500)
+    run_up_to_a_picture(world)
+    world.network.freeze("control@R")
+    # When it continues, messages of the detector arrive after those of the faster source.
+    late = world.network.stall("detect@R", "control@R")
+    world.run(300)
+    before = len(world.cycles)
+    world.network.thaw("control@R")
+    world.run(2.5 * P_MS)
+    world.network.heal(late)
+    world.run(300)
+    assert {later - earlier for earlier, later in pairwise(world.cycles[before - 1 :])} == {1}
+    used: dict[int, int | None] = {}
+    for inputs, value in zip(log.inputs, log.samples, strict=True):
+        used.setdefault(inputs["imu"].cycle, value)
+    require_never_older([used[cycle] for cycle in sorted(used)])
+
+
 #: Messages that arrive after those of the next run.
 OVERTAKEN = NetworkConditions(reordering=1.0, reorder_ns=80 * MS)
 

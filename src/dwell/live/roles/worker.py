@@ -136,6 +136,11 @@ class Worker:
         # Number of calls of process() in a row without an output to send; end of the last one.
         self._failed_in_a_row, self._failed_ns = 0, 0
         self._now_ns = 0
+        # Whether its standby may have used newer values than it has, after a silence, and the
+        # instant until which it then leaves the jobs to its standby.
+        has_standby = problem.pipeline.tasks[task].on[place.node].standby > 0
+        self._yields = has_standby and bool(self.samples.sources) and forwards
+        self._resumes_ns = 0
         # Sender of each link that the inputs may take. The stamper's beats compare the clocks.
         before = [
             (node, f"{source}@{node}")
@@ -331,14 +336,24 @@ class Worker:
     def active(self) -> bool:
         """Whether it runs jobs: it is no standby, or its primary is silent or not ready."""
         if not self.stands_by:
-            return True
+            return self._now_ns >= self._resumes_ns
         detector = self.pulse.detector
         self.pulse.own(self.stands_by, self._now_ns)
         beat = detector.last(self.stands_by)
-        patience_ns = 2 * self.place.period_ns
         return not (
-            beat and beat.ready and detector.fresh(self.stands_by, self._now_ns, patience_ns)
+            beat and beat.ready and detector.fresh(self.stands_by, self._now_ns, self._patience_ns)
         )
+
+    @property
+    def _patience_ns(self) -> int:
+        """Silence after which a standby takes over."""
+        return 2 * self.place.period_ns
+
+    def _follow(self, now_ns: int) -> None:
+        """Note the time; after a silence, leave the jobs that have waited to the standby."""
+        if self._yields and 0 < self._now_ns < now_ns - self._patience_ns:
+            self._resumes_ns = now_ns + 3 * self._interval_ns
+        self._now_ns = max(self._now_ns, now_ns)
 
     @property
     def warms_up(self) -> bool:
@@ -348,7 +363,7 @@ class Worker:
     def rest_s(self, now_ns: int) -> float:
         """Seconds after which a job may be due without a message."""
         # A standby must notice silence.
-        rest_s = 0.01 if self.stands_by else 0.2
+        rest_s = 0.2 if self.active and not self.stands_by else 0.01
         due_ns = self.copies.due_ns if self._source is None else self._source.due_ns
         return min(max((min(due_ns, self.copies.due_ns) - now_ns) / 1e9, 0.0), rest_s)
 
@@ -361,7 +376,7 @@ class Worker:
 
     def next_job(self, now_ns: int) -> Job | None:
         """Return the job to run now, or None; `run` and `finish` must follow."""
-        self._now_ns = now_ns
+        self._follow(now_ns)
         self.copies.send_due(now_ns)
         if self.busy_since_ns is not None or not self.started:
             return None
@@ -583,6 +598,9 @@ class Worker:
 
     def wake(self, now_ns: int) -> int:
         """Send the beat and the held messages that are due; return when to call again."""
-        self._now_ns = max(self._now_ns, now_ns)
+        self._follow(now_ns)
         self.copies.send_due(now_ns)
+        if now_ns < self._resumes_ns:
+            # Without a beat its standby continues.
+            return self._resumes_ns
         return min(self.pulse.wake(now_ns), self.copies.due_ns)
