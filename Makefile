@@ -69,13 +69,15 @@ BESIDE := -n auto --no-loadscope-reorder
 # Runs all tests that the marks in $(1) leave. Real processes that keep a period run next to the
 # others, which have a lower priority; tests that need the machine to themselves follow. Each part
 # keeps its failures in a folder of its own, so that none overwrites those of another.
-# pytest ends with 5 where ARGS leave nothing to run.
+# pytest ends with 5 where ARGS leave nothing to run. What a terminal interrupts is not sent to the
+# first part, which has a session of its own (conftest.py).
 define run_tests
 	@mkdir -p build; ok() { "$$@" || [ $$? -eq 5 ]; }; \
-	ok $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS) \
+	(exec $(TESTS) -o cache_dir=.pytest_cache/with_priority -m "$(1)with_priority" $(ARGS)) \
 		>build/with_priority.txt 2>&1 & prior=$$!; \
+	trap "kill -INT $$prior; wait; exit 130" INT TERM HUP; \
 	ok nice -n 10 $(TESTS) $(BESIDE) -m "$(1)not alone and not with_priority" $(ARGS); beside=$$?; \
-	wait $$prior; prior=$$?; cat build/with_priority.txt; \
+	ok wait $$prior; prior=$$?; trap - INT TERM HUP; cat build/with_priority.txt; \
 	ok $(TESTS) -o cache_dir=.pytest_cache/alone -m "$(1)alone" $(ARGS); alone=$$?; \
 	[ "$$beside $$prior $$alone" = "0 0 0" ]
 endef

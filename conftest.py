@@ -132,17 +132,17 @@ APART = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Let real processes that keep a period have the CPU before the tests side by side.
+    """Put real processes that keep a period into a session of their own.
 
     Their shadow jobs run in the lowest scheduling class, and need what the cell leaves: next to
     busy processes of the same session they starve, at any niceness, and a cell that has left its
     placement never proves that it may return. A kernel that shares the CPU by session (autogroup)
-    gives each session its share, by its niceness.
+    gives each session its share: by its niceness, which root may lower.
     """
-    if hasattr(config, "workerinput"):
+    if "with_priority" in config.option.markexpr.split(" and "):
         with suppress(OSError):
             os.setsid()
-            Path("/proc/self/autogroup").write_text("10")
+            Path("/proc/self/autogroup").write_text("-5")
 
 
 def pytest_xdist_auto_num_workers() -> int:
