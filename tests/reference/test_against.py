@@ -1276,6 +1276,17 @@ BY_HAND = {
         period_ms=10,
         windows=8,
     ),
+    "two jobs end within a nanosecond, against their order of events": by_hand(
+        [Node("R", "robot", cores=3, scheduler="fifo", background=0.0625)],
+        [
+            task("A", 1),
+            task("B", 0.999977, offset_ms=2.3e-5),
+            task("C", 2, threads=2),
+            task("D", 2),
+            task("E", 9),
+        ],
+        [Flow("A", "C"), Flow("B", "D")],
+    ),
     "the controller's node is down": by_hand(
         [EDGE, FIFO],
         [task("A", 1, "R"), task("B", 2, "E")],

@@ -47,8 +47,8 @@ template <class S>
     drop_job(s, cell_of(found.key), cycle_of(found.key), item_of(found.key), kNodeDown, now);
   }
   while (server.n_run > 0) {
-    const Job& first = s.job(running_of(s, server)->key);
-    leave(s, server, s.site(first), now);
+    const i64 key = running_of(s, server)->key;
+    leave(s, server, s.site(s.job(key)), key, now);
   }
   server.n_wait = 0;
   // Jobs that wait for their turn count, too.

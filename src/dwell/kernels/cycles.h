@@ -314,7 +314,7 @@ void complete(S& s, i64 key, i64 now) {
   Site& site = s.site(job);
   Server& server = s.server(site);
   if (server.next_key != key || server.next_ns != now) return;
-  leave(s, server, site, now);
+  leave(s, server, site, key, now);
   s.own_ns[site.own] += static_cast<f64>(site.threads) * static_cast<f64>(site.exec_ns[cycle]);
   job.compute_ns += now - job.started_ns;
   log_job(s, cell, cycle, task, job, kDone, now);
