@@ -93,6 +93,11 @@ class SampledInputs:
         values = self._values.items()
         return {name: one for name, one in values if one[0].stamp.key > left.get(name, none)}
 
+    def forget(self) -> None:
+        """Keep the values from later jobs here."""
+        for source in self._values:
+            self._leave(source, forwards=False)
+
     def stamped(self, stamp: Stamp) -> None:
         """Follow the task to its node under a stamp, unless a newer one is known."""
         placed = self._place.problem.candidates.get(stamp.placement)

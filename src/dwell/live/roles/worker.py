@@ -140,7 +140,7 @@ class Worker:
         # instant until which it then leaves the jobs to its standby.
         has_standby = problem.pipeline.tasks[task].on[place.node].standby > 0
         self._yields = has_standby and bool(self.samples.sources) and forwards
-        self._resumes_ns = 0
+        self._resumes_ns = -NEVER_NS
         # Sender of each link that the inputs may take. The stamper's beats compare the clocks.
         before = [
             (node, f"{source}@{node}")
@@ -350,10 +350,13 @@ class Worker:
         return 2 * self.place.period_ns
 
     def _follow(self, now_ns: int) -> None:
-        """Note the time; after a silence, leave the jobs that have waited to the standby."""
+        """After a silence, leave the jobs that have waited to the standby."""
         if self._yields and 0 < self._now_ns < now_ns - self._patience_ns:
             self._resumes_ns = now_ns + 3 * self._interval_ns
-        self._now_ns = max(self._now_ns, now_ns)
+        elif -NEVER_NS < self._resumes_ns <= now_ns:
+            # Newer messages than those that have waited may be lost.
+            self._resumes_ns = -NEVER_NS
+            self.samples.forget()
 
     @property
     def warms_up(self) -> bool:
@@ -377,6 +380,7 @@ class Worker:
     def next_job(self, now_ns: int) -> Job | None:
         """Return the job to run now, or None; `run` and `finish` must follow."""
         self._follow(now_ns)
+        self._now_ns = now_ns
         self.copies.send_due(now_ns)
         if self.busy_since_ns is not None or not self.started:
             return None
@@ -599,6 +603,7 @@ class Worker:
     def wake(self, now_ns: int) -> int:
         """Send the beat and the held messages that are due; return when to call again."""
         self._follow(now_ns)
+        self._now_ns = max(self._now_ns, now_ns)
         self.copies.send_due(now_ns)
         if now_ns < self._resumes_ns:
             # Without a beat its standby continues.
