@@ -11,6 +11,7 @@ import polars as pl
 import polars.testing
 import pytest
 
+from dwell.live.commands.live import status_lines
 from dwell.model import Caps, Chain, MissCap, Problem, Targets, Weights
 from tests.live.rated_cells import P_MS, SLOW, rated, sampling, world_of
 from tests.live.replayed import SYNCHRONOUS, Clocks, messages_of, recorded, replay, simulate
@@ -92,6 +93,8 @@ def test_the_status_has_ages_and_reaction_times_of_chains(every: int) -> None:
     assert len(steady) == 1
     assert world.status["window"]["cycles"] == 2 * SLOW
     assert world.status["window"]["ages"] == dict(zip(names, *steady, strict=True))
+    (age_ms, *_), *_ = steady
+    assert f"L95 of data age: see-act {age_ms:.1f} ms" in status_lines(world.status)
 
 
 def test_the_headline_names_the_chain_whose_data_are_too_old() -> None:

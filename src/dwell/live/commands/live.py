@@ -595,6 +595,12 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
             f"{shown_reason(window['reason'])}; "
             f"{released}silences {status['silences']}; utilisation {used}"
         )
+        ages = [
+            f"{name.removeprefix('age_l95_')} {'none' if ms is None else f'{ms:.1f} ms'}"
+            for name, ms in window.get("ages", {}).items()
+            if name.startswith("age_l95_")
+        ]
+        lines += [f"L95 of data age: {', '.join(ages)}"] if ages else []
     for who, topic in status["topics"].items():
         stamp_ms = topic["stamp_ms"]
         lines.append(
