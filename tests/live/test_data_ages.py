@@ -176,3 +176,22 @@ def test_a_reaction_that_ends_before_a_window_does_not_count_in_it() -> None:
     # No command falls in the single cycle between two windows.
     assert sum(lead == 1 for lead, _ in windows) > 5
     assert max(after_ms for _, after_ms in windows) < 1.5 * SLOW * P_MS
+
+
+def test_the_mean_age_of_a_chain_counts_commands_of_cycles_that_waited_for_long() -> None:
+    # A command every 15 ms in cycles of 10 ms: cycles wait, and take ever newer pictures.
+    on = {node: {"exec_ms": 1} for node in ("R", "E")}
+    changes = {
+        "deadline_ms": 640,
+        "tasks": {"camera": {"on": {"R": {"exec_ms": 1}}}, "act": {"every": 1, "on": on}},
+        "flows": [{"from": "camera", "to": "act", "sampled": True}],
+        "chains": {"see-act": {"from": "camera", "to": "act", "max_age_ms": 20}},
+        "candidates": {"LOC": {"act": "R"}, "EDGE": {"act": "E"}},
+        "controller": {"on": "E", "initial": "LOC"},
+    }
+    problem = aged(rated(**changes), "see-act")
+    world = World(problem, exec_ms={"camera": 1.0, "act": 15.0}, policy=Staying())
+    world.run(1_500)
+    *_, (l95_ms, age_ms) = columns(world, "windows", "l95_ms", "seen_age_ms")[:6]
+    assert l95_ms > 400
+    assert age_ms == pytest.approx(30.4, abs=0.2)

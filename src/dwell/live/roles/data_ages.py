@@ -76,13 +76,18 @@ class DataAges:
         self._chains, self._ledger = pipeline.chains, ledger
         self._sinks, self._rates = frozenset(pipeline.sinks), pipeline.rates
         self._period_ns, self._censor_ms = pipeline.period_ns, problem.censor_ms
+        self._max_age_ms = max(map(problem.max_age_ms, pipeline.sinks))
         self._latency, self._weighs_age = objective.latency, objective.weighs_age
         self.known: Mapping[str, KnownOrigins] = dict.fromkeys(self._chains, KnownOrigins())
 
     @property
     def reach_ns(self) -> int:
-        """Time before a window in which a command may count in the window's mean age."""
-        return round(self._censor_ms * 1e6) * (self._weighs_age or self._latency is not None)
+        """Time before a window in which a cycle's command may count in the window's mean age.
+
+        A cycle that waits may take a value that is newer than itself, until its command is too old.
+        """
+        reach_ms = self._censor_ms + self._max_age_ms
+        return round(reach_ms * 1e6) * (self._weighs_age or self._latency is not None)
 
     def closed(self, cycles: Sequence[LiveCycle]) -> None:
         """Record the cycles of a window, or between windows, whose end has come."""
