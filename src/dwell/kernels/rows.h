@@ -249,10 +249,10 @@ struct Crossing;  // of meter.cpp
   field(f64, l95_ms) field(f64, uncut_ms) field(f64, violation_rate) field(f64, sum)             \
   field(i64, on_robot)
 
-// The decision at the end of a window; `measured` is J of the window itself.
+// The decision at the end of a window.
 #define DWELL_DECIDED(field)                                                                     \
-  field(f64, measured) field(f64, delta_j) field(i64, dwell)                                     \
-  field(i32, incumbent) field(i32, placement) field(i32, reason)
+  field(f64, delta_j) field(i64, dwell) field(i32, incumbent) field(i32, placement)              \
+  field(i32, reason)
 
 // Intervals in order, without overlap (see on_off_intervals.h). `passed` counts the begins and ends
 // that are over.

@@ -303,12 +303,8 @@ bool decide(const Tables& s, i64 decision) {
   rule.dwell = moves ? 0 : rule.dwell + 1;
   rule.previous = incumbent;
   rule.incumbent = choice.placement;
-  s.decided[decision] = Decided{measured,
-                                choice.delta_j,
-                                rule.dwell,
-                                static_cast<i32>(incumbent),
-                                static_cast<i32>(choice.placement),
-                                choice.reason};
+  s.decided[decision] = Decided{choice.delta_j, rule.dwell, static_cast<i32>(incumbent),
+                                static_cast<i32>(choice.placement), choice.reason};
   return !moves;
 }
 
