@@ -16,7 +16,7 @@ def test_an_internal_error_is_not_dressed_up(cell: Path, monkeypatch: pytest.Mon
     def broken(*_: object, **__: object) -> None:
         raise KeyError("a bug")
 
-    monkeypatch.setattr("dwell.cellfile.load", broken)
+    monkeypatch.setattr("dwell.load", broken)
     assert isinstance(call("check", cell).exception, KeyError)
 
 
@@ -24,7 +24,7 @@ def test_interrupted_work_exits_with_130(cell: Path, monkeypatch: pytest.MonkeyP
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dwell.cellfile.load", interrupted)
+    monkeypatch.setattr("dwell.load", interrupted)
     result = call("check", cell)
     assert (result.exit_code, result.output) == (130, "")
 

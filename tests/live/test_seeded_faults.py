@@ -17,8 +17,8 @@ from msgspec.structs import replace as replaced
 from dwell.control import Guard, Probation
 from dwell.live.roles import health, stamper, worker
 from dwell.live.roles.controlled_cell import ControlledCell
-from dwell.live.roles.cycle_ledger import LiveCycle
 from dwell.live.roles.role import RolePlace
+from dwell.live.roles.run_rows import RunRows
 from dwell.live.roles.sink import Sink
 from dwell.live.roles.stamper import Stamper
 from dwell.live.roles.worker import Worker
@@ -244,7 +244,8 @@ def guard_watches_the_actuator(patch: pytest.MonkeyPatch) -> None:
 
 
 def records_what_was_not(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(LiveCycle, "actuated", property(lambda _: True))
+    values = RunRows._cycle_values
+    patch.setattr(RunRows, "_cycle_values", lambda *of: {**values(*of), "actuated": True})
 
 
 def overlooks_the_actuator(patch: pytest.MonkeyPatch) -> None:

@@ -299,6 +299,8 @@ class Drawing:
                 f"{windows} windows are more than are left: {self.cycles - begin} cycles"
             )
         self.drawn += cycles
+        # The rows of traces are known once they are drawn.
+        sampled = self._sampled(self._filled(cycles))
         node_changes, link_segments = self.changes
         return Realisation(
             scenario=self.name,
@@ -312,7 +314,7 @@ class Drawing:
             phases=self._phases(),
             trace_starts=tuple(self._trace_starts()),
             streams=self.streams,
-            **self._sampled(self._filled(cycles)),
+            **sampled,
         )
 
     def take_sent(self, realisation: Realisation, whole: Realisation | None) -> Realisation:

@@ -595,12 +595,7 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
             f"{shown_reason(window['reason'])}; "
             f"{released}silences {status['silences']}; utilisation {used}"
         )
-        ages = [
-            f"{name.removeprefix('age_l95_')} {'none' if ms is None else f'{ms:.1f} ms'}"
-            for name, ms in window.get("ages", {}).items()
-            if name.startswith("age_l95_")
-        ]
-        lines += [f"L95 of data age: {', '.join(ages)}"] if ages else []
+        lines += _ages(window)
     for who, topic in status["topics"].items():
         stamp_ms = topic["stamp_ms"]
         lines.append(
@@ -618,6 +613,17 @@ def status_lines(status: dict[str, Any], *, stages: bool = False) -> list[str]:
         note = f"  {process['note']}" if process["note"] else ""
         lines.append(f"  {who:24} {state:10} {process['age_ms']:8.0f} ms{note}")
     return lines + _stage_lines(status) if stages else lines
+
+
+def _ages(window: dict[str, Any]) -> Iterator[str]:
+    """Yield L95 of the data ages of chains, if there are any."""
+    ages = [
+        f"{name.removeprefix('age_l95_')} {'none' if ms is None else f'{ms:.1f} ms'}"
+        for name, ms in window.get("ages", {}).items()
+        if name.startswith("age_l95_")
+    ]
+    if ages:
+        yield f"L95 of data age: {', '.join(ages)}"
 
 
 def _stage_lines(status: dict[str, Any]) -> list[str]:
