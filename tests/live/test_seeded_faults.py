@@ -15,10 +15,9 @@ import pytest
 from msgspec.structs import replace as replaced
 
 from dwell.control import Guard, Probation
-from dwell.live.roles import health, stamper, worker
+from dwell.live.roles import health, run_rows, stamper, worker
 from dwell.live.roles.controlled_cell import ControlledCell
 from dwell.live.roles.role import RolePlace
-from dwell.live.roles.run_rows import RunRows
 from dwell.live.roles.sink import Sink
 from dwell.live.roles.stamper import Stamper
 from dwell.live.roles.worker import Worker
@@ -26,6 +25,7 @@ from dwell.live.wire import channels
 from dwell.live.wire.continuity import RESERVED, RunClaims
 from dwell.live.wire.messages import ACTUATED, Accepted, Hop, Order, Stamped
 from dwell.live.wire.routing import Routes
+from dwell.record import Row, Values, row_of
 from dwell_lab.chaos.faults import PlannedFault
 from dwell_lab.chaos.light_cell import CANDIDATES
 from tests.live.seeded_faults import (
@@ -244,8 +244,11 @@ def guard_watches_the_actuator(patch: pytest.MonkeyPatch) -> None:
 
 
 def records_what_was_not(patch: pytest.MonkeyPatch) -> None:
-    values = RunRows._cycle_values
-    patch.setattr(RunRows, "_cycle_values", lambda *of: {**values(*of), "actuated": True})
+    def told(types: Any, values: Values) -> Row:
+        changed = {"actuated": True} if "actuated" in values else {}
+        return row_of(types, {**values, **changed})
+
+    patch.setattr(run_rows, "row_of", told)
 
 
 def overlooks_the_actuator(patch: pytest.MonkeyPatch) -> None:
