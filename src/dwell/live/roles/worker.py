@@ -366,7 +366,7 @@ class Worker:
     def rest_s(self, now_ns: int) -> float:
         """Seconds after which a job may be due without a message."""
         # A standby must notice silence.
-        rest_s = 0.2 if self.active and not self.stands_by else 0.01
+        rest_s = 0.2 if not self.stands_by and self.active else 0.01
         due_ns = self.copies.due_ns if self._source is None else self._source.due_ns
         return min(max((min(due_ns, self.copies.due_ns) - now_ns) / 1e9, 0.0), rest_s)
 
