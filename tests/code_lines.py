@@ -21,7 +21,7 @@ FLATS = {
     "simulator": ("src/dwell",),
 }
 #: The most lines of code.
-MOST = {"simulator": 28_258, "live": 16_505, "lab": 6_807}
+MOST = {"simulator": 28_258, "live": 16_504, "lab": 6_807}
 
 
 def code_lines(text: str) -> int:

@@ -126,7 +126,7 @@ class LiveWindows:
             known=self._by_key,
         )
         #: Whether decisions are more frequent than windows.
-        self.often = problem.decide_cycles < self._size
+        self.often = problem.decides_within_windows
         self._window = _Stretch(self._size)
         self._stretch = _Stretch(problem.decide_cycles) if self.often else self._window
         # In order of release: decided cycles that the next decision may look at, then cycles that

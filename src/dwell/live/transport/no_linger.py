@@ -16,7 +16,7 @@ import struct
 import threading
 from contextlib import suppress
 
-from dwell.live.failures import start_thread
+from dwell.live.failures import start_repeating
 
 #: Folder with the descriptors of this process.
 OPEN = "/dev/fd"
@@ -37,17 +37,16 @@ class Connections:
 
     def start(self) -> None:
         """Start the periodic search in a thread."""
-        start_thread("dwell-lingering", self._run)
+        start_repeating("dwell-lingering", EVERY_S, self._stopped, self._search)
 
     def stop(self) -> None:
         """Stop the search."""
         self._stopped.set()
 
-    def _run(self) -> None:
-        while not self._stopped.wait(EVERY_S):
-            # The search needs a descriptor, and may fail while none is free.
-            with suppress(OSError):
-                self.wait_for_nobody()
+    def _search(self) -> None:
+        # The search needs a descriptor, and may fail while none is free.
+        with suppress(OSError):
+            self.wait_for_nobody()
 
     def wait_for_nobody(self) -> None:
         """Disable SO_LINGER on all present connections."""
